@@ -1,0 +1,202 @@
+"""RigCalibration: the result of a calibration, and its file `calibration.json` (schema 1 of formats.md)."""
+
+import json
+import os
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from rig_calib.depth_model import DepthCorrection
+from rig_protocol.camera import as_pose
+from rig_protocol.errors import DataError
+from rig_protocol.poses import Pose
+from rig_protocol.rig_folder import read_json
+
+SCHEMA = 1
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CalibratedCamera:
+    """Pose of one colour camera: T_true = T_rig_camera · Exp(δ), δ ~ N(0, covariance), rotation (rad) first."""
+
+    id: int
+    name: str
+    T_rig_camera: Pose
+    covariance: npt.NDArray[np.float64] | None = None
+    depth_correction: DepthCorrection | None = None
+    serial: str | None = None
+
+    def to_dict(self) -> dict[str, Any]:
+        """One item of `cameras`."""
+        return {
+            "id": self.id,
+            "name": self.name,
+            "serial": self.serial,
+            "T_rig_camera": self.T_rig_camera.tolist(),
+            "covariance": None if self.covariance is None else self.covariance.tolist(),
+            "depth_correction": None if self.depth_correction is None else self.depth_correction.to_dict(),
+        }
+
+    @classmethod
+    def from_dict(cls, values: Mapping[str, Any]) -> "CalibratedCamera":
+        """Read one item of `cameras`."""
+        covariance, correction = values.get("covariance"), values.get("depth_correction")
+        return cls(
+            id=int(values["id"]),
+            name=str(values["name"]),
+            T_rig_camera=as_pose(values["T_rig_camera"], "T_rig_camera"),
+            covariance=None if covariance is None else np.array(covariance, dtype=np.float64).reshape(6, 6),
+            depth_correction=None if correction is None else DepthCorrection.from_dict(correction),
+            serial=values.get("serial"),
+        )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class CalibratedEdge:
+    """One pair of cameras with a common view; `T_i_j` is what this edge alone measured."""
+
+    i: int
+    j: int
+    matches: int
+    inliers: int
+    rms_mm: float
+    T_i_j: Pose
+    used: bool
+    reason: str | None = None
+
+    def to_dict(self) -> dict[str, Any]:
+        """One item of `edges`."""
+        return {
+            "i": self.i,
+            "j": self.j,
+            "matches": self.matches,
+            "inliers": self.inliers,
+            "rms_mm": self.rms_mm,
+            "T_i_j": self.T_i_j.tolist(),
+            "used": self.used,
+            "reason": self.reason,
+        }
+
+    @classmethod
+    def from_dict(cls, values: Mapping[str, Any]) -> "CalibratedEdge":
+        """Read one item of `edges`."""
+        return cls(
+            int(values["i"]),
+            int(values["j"]),
+            int(values["matches"]),
+            int(values["inliers"]),
+            float(values["rms_mm"]),
+            as_pose(values["T_i_j"], "T_i_j"),
+            bool(values["used"]),
+            values.get("reason"),
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class LoopClosure:
+    """By how much the ring of edges fails to close, before and after the optimisation."""
+
+    before_deg: float
+    before_mm: float
+    after_deg: float
+    after_mm: float
+
+    def to_dict(self) -> dict[str, Any]:
+        """The `loop_closure` object."""
+        return {
+            "before": {"rotation_deg": self.before_deg, "translation_mm": self.before_mm},
+            "after": {"rotation_deg": self.after_deg, "translation_mm": self.after_mm},
+        }
+
+    @classmethod
+    def from_dict(cls, values: Mapping[str, Any]) -> "LoopClosure":
+        """Read the `loop_closure` object."""
+        before, after = values["before"], values["after"]
+        return cls(
+            float(before["rotation_deg"]),
+            float(before["translation_mm"]),
+            float(after["rotation_deg"]),
+            float(after["translation_mm"]),
+        )
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RigCalibration:
+    """Where every colour camera of the rig is, how well that is known, and from what it was found.
+
+    `failures` are the reasons why the result does not pass its own gate; empty means it passes.
+    """
+
+    method: str
+    rig_frame: str
+    cameras: tuple[CalibratedCamera, ...]
+    edges: tuple[CalibratedEdge, ...]
+    loop_closure: LoopClosure | None
+    seconds: Mapping[str, float]
+    frames_used: int
+    created: str = ""
+    provenance: Mapping[str, Any] = field(default_factory=dict)
+    warnings: tuple[str, ...] = ()
+    failures: tuple[str, ...] = ()
+
+    def camera(self, camera_id: int) -> CalibratedCamera | None:
+        """The camera with this id, or None when the calibration could not place it."""
+        return next((camera for camera in self.cameras if camera.id == camera_id), None)
+
+    def to_dict(self) -> dict[str, Any]:
+        """The `calibration.json` form."""
+        return {
+            "schema": SCHEMA,
+            "created": self.created,
+            "method": self.method,
+            "rig_frame": self.rig_frame,
+            "provenance": dict(self.provenance),
+            "cameras": [camera.to_dict() for camera in self.cameras],
+            "edges": [edge.to_dict() for edge in self.edges],
+            "loop_closure": None if self.loop_closure is None else self.loop_closure.to_dict(),
+            "seconds": dict(self.seconds),
+            "frames_used": self.frames_used,
+            "warnings": list(self.warnings),
+            "failures": list(self.failures),
+        }
+
+    @classmethod
+    def from_dict(cls, values: Mapping[str, Any]) -> "RigCalibration":
+        """Read the `calibration.json` form; DataError when it is malformed or of another schema."""
+        if not isinstance(values, Mapping) or values.get("schema") != SCHEMA:
+            raise DataError(f"not a calibration of schema {SCHEMA}; make a new one with `rig-calib solve`")
+        try:
+            loop = values.get("loop_closure")
+            return cls(
+                method=str(values["method"]),
+                rig_frame=str(values["rig_frame"]),
+                cameras=tuple(map(CalibratedCamera.from_dict, values["cameras"])),
+                edges=tuple(map(CalibratedEdge.from_dict, values["edges"])),
+                loop_closure=None if loop is None else LoopClosure.from_dict(loop),
+                seconds={str(key): float(value) for key, value in values["seconds"].items()},
+                frames_used=int(values["frames_used"]),
+                created=str(values.get("created", "")),
+                provenance=dict(values.get("provenance", {})),
+                warnings=tuple(map(str, values.get("warnings", ()))),
+                failures=tuple(map(str, values.get("failures", ()))),
+            )
+        except (AttributeError, KeyError, TypeError, ValueError) as error:
+            raise DataError(f"malformed calibration: {error!r}") from error
+
+    def save(self, path: Path) -> None:
+        """Write the file whole or not at all."""
+        part = path.with_name(path.name + ".part")
+        part.write_text(json.dumps(self.to_dict(), indent=1) + "\n")
+        os.replace(part, path)
+
+    @classmethod
+    def load(cls, path: Path) -> "RigCalibration":
+        """Read a `calibration.json`; ConfigurationError when absent, DataError when malformed."""
+        try:
+            return cls.from_dict(read_json(path))
+        except DataError as error:
+            raise DataError(f"{path}: {error}") from error

@@ -1,0 +1,1 @@
+"""What agent, server and calibration must agree on: types, bytes on the wire, file formats."""

@@ -1,0 +1,75 @@
+"""What a link tells its owner: the only things that come out of `next_event()`."""
+
+from dataclasses import dataclass
+
+from rig_protocol.frames import EncodedFrame
+from rig_protocol.messages import Hello, RejectReason, Welcome
+
+Address = tuple[str, int]
+
+
+# ---- agent side
+
+
+@dataclass(frozen=True, slots=True)
+class Connected:
+    """The server accepted the hello."""
+
+    welcome: Welcome
+
+
+@dataclass(frozen=True, slots=True)
+class Rejected:
+    """The server refused the hello; `text` is for the operator. The link retries by itself."""
+
+    reason: RejectReason
+    text: str
+
+
+@dataclass(frozen=True, slots=True)
+class Disconnected:
+    """The session ended (time-out, goodbye, server restart); the link says hello again by itself."""
+
+    text: str
+
+
+AgentEvent = Connected | Rejected | Disconnected
+
+
+# ---- server side
+
+
+@dataclass(frozen=True, slots=True)
+class CameraJoined:
+    """A camera's hello was accepted."""
+
+    camera_id: int
+    hello: Hello
+    address: Address
+
+
+@dataclass(frozen=True, slots=True)
+class CameraLeft:
+    """A camera said goodbye, fell silent or was replaced by its own new session."""
+
+    camera_id: int
+    text: str
+
+
+@dataclass(frozen=True, slots=True)
+class HelloRefused:
+    """A hello was answered with a reject; at most one event a second and address."""
+
+    address: Address
+    reason: RejectReason
+    text: str
+
+
+@dataclass(frozen=True, slots=True)
+class FrameReceived:
+    """A whole frame, stamped in rig time with its clock uncertainty."""
+
+    frame: EncodedFrame
+
+
+ServerEvent = CameraJoined | CameraLeft | HelloRefused | FrameReceived

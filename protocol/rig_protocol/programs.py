@@ -1,0 +1,46 @@
+"""What the three programs share: one place that maps errors to exit codes and says them to the operator."""
+
+import logging
+import os
+import signal
+import sys
+from types import FrameType
+
+import typer
+from rich.console import Console
+from rich.logging import RichHandler
+
+from rig_protocol.errors import RigError
+
+EXIT_DONE, EXIT_FAILED, EXIT_USAGE = 0, 1, 2
+
+
+def run_program(app: typer.Typer) -> None:
+    """Run a typer app: 0 done, 1 the work failed, 2 wrong usage or configuration; SIGTERM ends as Ctrl-C does."""
+    signal.signal(signal.SIGTERM, _raise_keyboard_interrupt)
+    console = Console(stderr=True, highlight=False)
+    try:
+        app()
+    except RigError as error:
+        console.print(f"[bold red]error:[/] {error}", markup=True, soft_wrap=True)
+        sys.exit(error.exit_status)
+    except BrokenPipeError:
+        # The reader of our output went away (`rig-server | head`); keep the interpreter from complaining.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        sys.exit(EXIT_FAILED)
+
+
+def set_up_logging(level: str = "INFO") -> None:
+    """Log to stderr: with colours on a terminal, plain lines for journald otherwise."""
+    handler: logging.Handler
+    if sys.stderr.isatty():
+        handler = RichHandler(console=Console(stderr=True), show_path=False, rich_tracebacks=True)
+        handler.setFormatter(logging.Formatter("%(message)s"))
+    else:
+        handler = logging.StreamHandler()
+        handler.setFormatter(logging.Formatter("%(levelname)s %(name)s: %(message)s"))
+    logging.basicConfig(level=level.upper(), handlers=[handler], force=True)
+
+
+def _raise_keyboard_interrupt(_signal: int, _frame: FrameType | None) -> None:
+    raise KeyboardInterrupt

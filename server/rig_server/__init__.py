@@ -1,0 +1,1 @@
+"""The program on the PC: receive, decode and synchronise frames, then calibrate or fuse."""
