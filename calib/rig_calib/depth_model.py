@@ -17,7 +17,8 @@ MAX_TERMS = 6
 class DepthCorrection:
     """z_true = z · (1 + Σ c_k b_k(x, y)), with b = (1, x, y, x², xy, y²) as far as there are coefficients.
 
-    x = (u − cx)/fx and y = (v − cy)/fy of the pixel (u, v) that holds the depth, in the camera whose grid it is on.
+    x = (u − cx)/fx and y = (v − cy)/fy of the pixel (u, v) that holds the
+    depth, in the camera whose grid it is on.
     """
 
     coefficients: tuple[float, ...]
@@ -26,7 +27,8 @@ class DepthCorrection:
         """The `depth_correction` object of `calibration.json`."""
         return {
             "model": MODEL_NAME,
-            "equation": "z_true = z * (1 + sum c_k b_k(x, y)); b = 1, x, y, x^2, xy, y^2; x = (u - cx)/fx, y = (v - cy)/fy",
+            "equation": "z_true = z * (1 + sum c_k b_k(x, y)); b = 1, x, y, x^2, xy, y^2; "
+            "x = (u - cx)/fx, y = (v - cy)/fy",
             "coefficients": list(self.coefficients),
         }
 

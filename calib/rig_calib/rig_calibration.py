@@ -1,7 +1,6 @@
 """RigCalibration: the result of a calibration, and its file `calibration.json` (schema 1 of formats.md)."""
 
 import json
-import os
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -21,7 +20,7 @@ SCHEMA = 1
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CalibratedCamera:
-    """Pose of one colour camera: T_true = T_rig_camera · Exp(δ), δ ~ N(0, covariance), rotation (rad) first."""
+    """Pose of one colour camera: T_true = T_rig_camera · Exp(δ), δ ~ N(0, covariance), rotation first."""
 
     id: int
     name: str
@@ -191,7 +190,7 @@ class RigCalibration:
         """Write the file whole or not at all."""
         part = path.with_name(path.name + ".part")
         part.write_text(json.dumps(self.to_dict(), indent=1) + "\n")
-        os.replace(part, path)
+        part.replace(path)
 
     @classmethod
     def load(cls, path: Path) -> "RigCalibration":

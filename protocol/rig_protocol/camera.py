@@ -1,4 +1,4 @@
-"""What is known of one Kinect before calibration: both cameras, the transform between them, disparity to metres.
+"""What is known of one Kinect before calibration: both cameras, their transform, disparity to metres.
 
 Data only. Projection lives with its users, so that the simulator and the estimator that it judges
 share no formula.

@@ -56,7 +56,9 @@ def _environment(model: type[Settings], prefix: str) -> dict[str, Any]:
     known = [f"{prefix}{name}".upper() for name in model.model_fields]
     for variable in os.environ:
         if variable.startswith(prefix) and variable.split("__")[0] not in known:
-            raise ConfigurationError(f"environment variable {variable} names no setting{_nearest(variable, known)}")
+            raise ConfigurationError(
+                f"environment variable {variable} names no setting{_nearest(variable, known)}"
+            )
     source = EnvSettingsSource(
         model,  # type: ignore[arg-type]  # the source reads fields only; our models are no BaseSettings
         env_prefix=prefix,

@@ -1,0 +1,29 @@
+# Every target does its own set-up: it needs Python >= 3.11 with venv, make and a package index.
+PYTHON ?= python3
+VENV   := .venv
+BIN    := $(VENV)/bin
+READY  := $(VENV)/.ready
+
+.PHONY: demo test lint bench-codecs docs clean
+
+demo: $(READY)  ## twelve simulated Kinects over loopback UDP, calibrated and fused into build/demo
+	$(BIN)/rig-server --calibrate --simulate 12 --frames 5 --out build/demo
+
+test: $(READY)  ## the whole test suite
+	$(BIN)/pytest -n 2
+
+lint: $(READY)  ## style, types, import rules
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/mypy
+	$(BIN)/lint-imports
+
+clean:  ## everything that make built
+	rm -rf $(VENV) build
+
+# The lock file pins what was tested; the stamp is newer than everything it was made from.
+$(READY): pyproject.toml requirements.lock
+	$(PYTHON) -m venv $(VENV)
+	$(BIN)/python -m pip install --quiet --upgrade pip
+	$(BIN)/python -m pip install --quiet --constraint requirements.lock --editable '.[dev]'
+	touch $@
