@@ -16,7 +16,7 @@ EXIT_DONE, EXIT_FAILED, EXIT_USAGE = 0, 1, 2
 
 
 def run_program(app: typer.Typer) -> None:
-    """Run a typer app: 0 done, 1 the work failed, 2 wrong usage or configuration; SIGTERM ends as Ctrl-C does."""
+    """Run a typer app: 0 done, 1 the work failed, 2 wrong usage. SIGTERM ends it as Ctrl-C does."""
     signal.signal(signal.SIGTERM, _raise_keyboard_interrupt)
     console = Console(stderr=True, highlight=False)
     try:
