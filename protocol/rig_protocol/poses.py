@@ -10,9 +10,8 @@ import numpy.typing as npt
 Pose = npt.NDArray[np.float64]
 Vector = npt.NDArray[np.float64]
 
-_SMALL_ANGLE_RAD = (
-    1e-3  # below this the closed forms lose digits to cancellation; the series are exact to 1e-14
-)
+# Below this the closed forms lose digits to cancellation and the series hold to 1e-14.
+_SMALL_ANGLE_RAD = 1e-3
 
 
 def hat(v: Vector) -> Vector:

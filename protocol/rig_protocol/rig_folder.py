@@ -191,9 +191,9 @@ def read_frame(folder: Path, camera: CameraEntry, index: int) -> RgbdFrame:
         camera_id=camera.id,
         sequence=index,
         timestamp_ns=index * _FRAME_PERIOD_NS,
-        color=color,  # type: ignore[arg-type]  # _read_image checked the dtype
-        raw=raw,  # type: ignore[arg-type]
-        depth_mm=depth_mm,  # type: ignore[arg-type]
+        color=color,  # _read_image checked the dtype
+        raw=raw,
+        depth_mm=depth_mm,
         depth_frame="color" if depth_frame == "color" else "depth",
     )
 

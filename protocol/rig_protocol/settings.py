@@ -1,4 +1,4 @@
-"""Settings of a program: a validated model filled from command line, environment and a TOML file, in that order."""
+"""Settings of a program: a validated model filled from command line, environment and a TOML file."""
 
 import difflib
 import os
