@@ -22,7 +22,8 @@ def run_program(app: typer.Typer) -> None:
     try:
         app()
     except RigError as error:
-        console.print(f"[bold red]error:[/] {error}", markup=True, soft_wrap=True)
+        console.print("error:", style="bold red", end=" ")
+        console.print(str(error), markup=False, soft_wrap=True)
         sys.exit(error.exit_status)
     except BrokenPipeError:
         # The reader of our output went away (`rig-server | head`); keep the interpreter from complaining.

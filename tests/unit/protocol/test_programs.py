@@ -1,0 +1,40 @@
+"""Rules of the programs' exit codes."""
+
+import subprocess
+import sys
+
+import pytest
+
+PROGRAM = """
+import typer
+from rig_protocol.errors import ConfigurationError, DataError, RigError
+from rig_protocol.programs import run_program
+app = typer.Typer()
+@app.command()
+def work(outcome: str) -> None:
+    errors = {"failed": RigError("camera 3 is [not] there"), "usage": ConfigurationError("no such key"),
+              "torn": DataError("a file is torn"), "stopped": KeyboardInterrupt()}
+    if outcome in errors:
+        raise errors[outcome]
+run_program(app)
+"""
+
+
+@pytest.mark.parametrize(
+    ("arguments", "status", "message"),
+    [
+        (["done"], 0, ""),
+        (["failed"], 1, "camera 3 is [not] there"),
+        (["torn"], 1, "a file is torn"),
+        (["usage"], 2, "no such key"),
+        (["--nonsense"], 2, "No such option"),
+        (["stopped"], 130, ""),
+    ],
+)
+def test_the_exit_status_tells_the_kind_of_failure(arguments: list[str], status: int, message: str) -> None:
+    done = subprocess.run(
+        [sys.executable, "-c", PROGRAM, *arguments], capture_output=True, text=True, check=False
+    )
+    assert done.returncode == status
+    assert message in done.stderr
+    assert "Traceback" not in done.stderr
