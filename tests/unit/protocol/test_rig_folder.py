@@ -6,7 +6,6 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from support.real_data import real_data
 
 from rig_protocol.camera import CameraModel
 from rig_protocol.errors import ConfigurationError, DataError
@@ -22,6 +21,7 @@ from rig_protocol.rig_folder import (
     write_rig_folder,
     write_true_poses,
 )
+from support.real_data import real_data
 
 RNG = np.random.default_rng(7)
 COLOR = RNG.integers(0, 256, (48, 64, 3), dtype=np.uint8)
