@@ -13,13 +13,16 @@ ColorImage = Literal["bayer", "bgr", "grey"]
 DepthImage = Literal["raw", "depth_mm"]
 
 
-class SourceLost(RigError):
+class SourceLost(RigError):  # noqa: N818  # it reads as what happened: the source is lost
     """The device died or cannot be opened now: close the source, wait, open it again."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class SourceDescription:
-    """Who the device is and what it delivers; None for an image that it does not deliver."""
+    """Who the device is and what it delivers; None for an image that it does not deliver.
+
+    `camera_id` is the slot that a recording remembers; a live device knows none.
+    """
 
     serial: str | None
     port_path: str | None
@@ -27,6 +30,7 @@ class SourceDescription:
     fps: float
     color_image: ColorImage | None
     depth_image: DepthImage | None
+    camera_id: int | None = None
 
 
 class FrameSource(Protocol):
