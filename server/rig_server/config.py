@@ -1,0 +1,149 @@
+"""Settings of `rig-server`: `rig.toml`, environment `RIG_SERVER_*` and the command line."""
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, Self
+
+from pydantic import Field, field_validator, model_validator
+
+from rig_calib.settings import CalibrationSettings
+from rig_protocol.camera import CameraModel
+from rig_protocol.errors import ConfigurationError, DataError
+from rig_protocol.events import Address
+from rig_protocol.rig_folder import RingDrawing, read_json
+from rig_protocol.settings import Settings, load_settings
+
+ENVIRONMENT_PREFIX = "RIG_SERVER_"
+CONFIG_PLACES = (Path("rig.toml"), Path("/etc/kinect-rig/rig.toml"))
+DEFAULT_PORT = 7400
+MAX_CAMERAS = 64  # what one server holds in memory and one roster names; a ring has twelve
+
+
+class RingSettings(Settings):
+    """The drawing of the ring and how exactly it was built (standard deviation on each axis)."""
+
+    radius_m: float = Field(0.22, ge=0, le=10)
+    """Distance of the colour cameras from the ring's axis."""
+    yaw_step_deg: float = Field(30.0, gt=0, le=180)
+    """Angle from one camera to the next, counter-clockwise seen from above."""
+    tolerance_deg: float = Field(1.0, gt=0, le=180)
+    """By how much a camera is turned against the drawing."""
+    tolerance_m: float = Field(0.005, gt=0, le=10)
+    """By how much a camera is moved against the drawing."""
+
+    def drawing(self) -> RingDrawing:
+        """The same numbers as the calibration takes them."""
+        return RingDrawing(self.radius_m, self.yaw_step_deg, self.tolerance_deg, self.tolerance_m)
+
+
+class CameraSettings(Settings):
+    """One camera of the rig. A hello that gives no slot finds its own by serial or port path."""
+
+    id: int = Field(ge=0, lt=MAX_CAMERAS, examples=[0])
+    """Slot in the ring; slot 0 defines the rig's x axis."""
+    name: str | None = Field(None, pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]{0,31}$", examples=["cam00"])
+    """Name in tables, reports and recordings; unset: cam00, cam01, ..."""
+    serial: str | None = Field(None, examples=["A00366A10921051A"])
+    """Serial number that the Kinect reports."""
+    port_path: str | None = Field(None, examples=["1-1.2"])
+    """USB port on its Pi, for a Kinect that reports no serial number (models 1473 and K4W)."""
+    intrinsics: Path | None = Field(None, examples=[Path("intrinsics/cam00.json")])
+    """Intrinsics measured with `rig-calib intrinsics`; unset: what the agent sends."""
+
+    @property
+    def label(self) -> str:
+        """The name, or the one that follows from the slot."""
+        return self.name or f"cam{self.id:02d}"
+
+
+class SynchroniserSettings(Settings):
+    """How frames of free-running cameras are grouped into panoramic frames."""
+
+    max_spread_ms: float | None = Field(None, gt=0, examples=[33.3])
+    """Widest exposure spread of a set; unset: one frame period of the cameras."""
+    deadline_ms: float = Field(100.0, gt=0, le=10_000)
+    """How long after one frame period a set waits for a frame that is late before it goes out partial."""
+
+
+class CaptureSettings(Settings):
+    """What `--calibrate` waits for and collects."""
+
+    frames: int = Field(5, ge=1, le=100)
+    """Panoramic frames to calibrate on."""
+    wait_s: float = Field(60.0, gt=0, le=86_400)
+    """How long to wait for the expected cameras, and then for complete sets."""
+
+
+class RigSettings(Settings):
+    """Settings of rig-server. Write your own values over the defaults below."""
+
+    listen: str = "0.0.0.0:7400"  # agents are on other machines: all interfaces are the purpose
+    """Address and UDP port to receive on."""
+    expected_cameras: int | None = Field(None, ge=1, le=MAX_CAMERAS, examples=[12])
+    """How many cameras to wait for when none are listed below; unset: as many as come."""
+    receive_buffer_bytes: int = Field(8 << 20, ge=65_536, le=1 << 30)
+    """Kernel receive buffer to ask for; the kernel's limit is net.core.rmem_max."""
+    decoder_threads: int = Field(2, ge=1, le=64)
+    """Threads that decode frames; a pair takes about 3 ms of one core."""
+    synchroniser: SynchroniserSettings = SynchroniserSettings()
+    capture: CaptureSettings = CaptureSettings()
+    calibration: CalibrationSettings = CalibrationSettings()
+    ring: RingSettings | None = None
+    """The drawing of the ring; leave it out when the cameras' places are unknown."""
+    cameras: tuple[CameraSettings, ...] = ()
+    """The cameras that belong to the rig; when none are listed, any agent may join."""
+
+    @field_validator("listen")
+    @classmethod
+    def _listen_is_an_address(cls, text: str) -> str:
+        parse_address(text)
+        return text
+
+    @model_validator(mode="after")
+    def _cameras_are_distinct(self) -> Self:
+        for key in ("id", "label", "serial"):
+            values = [getattr(camera, key) for camera in self.cameras]
+            twice = {value for value in values if value is not None and values.count(value) > 1}
+            if twice:
+                raise ValueError(f"two cameras share {'name' if key == 'label' else key} {min(twice)!r}")
+        if self.cameras and self.expected_cameras not in (None, len(self.cameras)):
+            raise ValueError(f"expected_cameras is {self.expected_cameras}, {len(self.cameras)} are listed")
+        return self
+
+    @property
+    def address(self) -> Address:
+        """`listen` as (host, port)."""
+        return parse_address(self.listen)
+
+
+def load_rig_settings(file: Path | None, overrides: Mapping[str, Any] | None = None) -> RigSettings:
+    """Settings from `file`, else ./rig.toml, else /etc/kinect-rig/rig.toml, else the defaults."""
+    found = file or next((place for place in CONFIG_PLACES if place.is_file()), None)
+    settings = load_settings(RigSettings, found, ENVIRONMENT_PREFIX, overrides)
+    if found is None:
+        return settings
+    cameras = [_beside(found, camera) for camera in settings.cameras]
+    return settings.model_copy(update={"cameras": tuple(cameras)})
+
+
+def parse_address(text: str) -> Address:
+    """HOST:PORT, HOST or :PORT; ValueError says what is wrong with it."""
+    host, _, port_text = text.rpartition(":") if ":" in text else (text, "", str(DEFAULT_PORT))
+    if not port_text.isdecimal() or not 0 <= int(port_text) <= 65_535:
+        raise ValueError(f"{text!r} is not HOST:PORT with a port from 0 to 65535")
+    return host or "0.0.0.0", int(port_text)  # noqa: S104  # an empty host means all interfaces, as in `:7400`
+
+
+def read_intrinsics(path: Path) -> CameraModel:
+    """A camera model file; ConfigurationError when it is absent or malformed."""
+    try:
+        return CameraModel.from_dict(read_json(path))
+    except DataError as error:
+        raise ConfigurationError(f"intrinsics file {path}: {error}") from error
+
+
+def _beside(file: Path, camera: CameraSettings) -> CameraSettings:
+    """Intrinsics paths in rig.toml are relative to it."""
+    if camera.intrinsics is None:
+        return camera
+    return camera.model_copy(update={"intrinsics": file.parent / camera.intrinsics})

@@ -1,0 +1,280 @@
+"""Rules of the synchroniser, in virtual time."""
+
+import itertools
+from collections.abc import Iterable
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from rig_protocol.frames import PanoramicFrame, RgbdFrame
+from rig_server.synchroniser import MAX_PENDING, Synchroniser
+
+MS = 1_000_000
+PERIOD_NS = 33_333_333
+DEADLINE_NS = 100 * MS
+
+
+def frame(camera_id: int, timestamp_ns: int, sequence: int = 0) -> RgbdFrame:
+    return RgbdFrame(camera_id=camera_id, sequence=sequence, timestamp_ns=timestamp_ns)
+
+
+def joined(cameras: Iterable[int], fps: float = 30.0, **options: int) -> Synchroniser:
+    synchroniser = Synchroniser(cameras := list(cameras), deadline_ns=DEADLINE_NS, **options)
+    for camera_id in cameras:
+        synchroniser.camera_joined(camera_id, fps)
+    return synchroniser
+
+
+def run(
+    synchroniser: Synchroniser, arrivals: Iterable[tuple[int, RgbdFrame]], until_ns: int | None = None
+) -> list[tuple[int, PanoramicFrame]]:
+    """Feed (arrival time, frame) in order, fire time-outs in between; (delivery time, set)."""
+    delivered: list[tuple[int, PanoramicFrame]] = []
+
+    def drain(now_ns: int) -> None:
+        while (panorama := synchroniser.next_panorama(now_ns)) is not None:
+            delivered.append((now_ns, panorama))
+
+    def fire_timeouts(before_ns: int) -> None:
+        while (due_ns := synchroniser.next_timeout_ns()) is not None and due_ns <= before_ns:
+            drain(due_ns)
+
+    for now_ns, item in sorted(arrivals, key=lambda pair: pair[0]):
+        fire_timeouts(now_ns)
+        synchroniser.add(item, now_ns)
+        drain(now_ns)
+    fire_timeouts(10**15 if until_ns is None else until_ns)
+    return delivered
+
+
+def stream(
+    camera_id: int, phase_ns: int, count: int, period_ns: int = PERIOD_NS, latency_ns: int = 40 * MS
+) -> list[tuple[int, RgbdFrame]]:
+    times = [phase_ns + k * period_ns for k in range(count)]
+    return [(time + latency_ns, frame(camera_id, time, k)) for k, time in enumerate(times)]
+
+
+def tightest_spread_ns(phases_ns: Iterable[int]) -> int:
+    """One period less the widest gap between phases on the circle."""
+    sorted_ns = sorted(phase % PERIOD_NS for phase in phases_ns)
+    gaps = np.diff([*sorted_ns, sorted_ns[0] + PERIOD_NS])
+    return int(PERIOD_NS - gaps.max())
+
+
+def test_a_set_is_complete_as_soon_as_every_connected_camera_has_its_frame() -> None:
+    synchroniser = joined([0, 1, 2])
+    for camera_id in (0, 1):
+        synchroniser.add(frame(camera_id, 10 * MS), 50 * MS)
+        assert synchroniser.next_panorama(50 * MS) is None
+    synchroniser.add(frame(2, 12 * MS), 60 * MS)
+    panorama = synchroniser.next_panorama(60 * MS)
+    assert panorama is not None
+    assert panorama.complete
+    assert panorama.spread_ns == 2 * MS
+    assert panorama.timestamp_ns == 10_666_666
+    assert synchroniser.counters.complete == 1
+
+
+def test_a_set_goes_out_partial_one_period_and_the_deadline_after_its_first_frame() -> None:
+    synchroniser = joined([0, 1, 2])
+    synchroniser.add(frame(0, 10 * MS), 50 * MS)
+    synchroniser.add(frame(2, 11 * MS), 52 * MS)
+    due_ns = synchroniser.next_timeout_ns()
+    assert due_ns == 50 * MS + PERIOD_NS + DEADLINE_NS
+    assert synchroniser.next_panorama(due_ns - 1) is None
+    panorama = synchroniser.next_panorama(due_ns)
+    assert panorama is not None
+    assert panorama.missing == (1,)
+    assert synchroniser.next_timeout_ns() is None
+    assert synchroniser.counters.partial == 1
+
+
+def test_a_frame_that_comes_after_its_set_is_counted_late() -> None:
+    synchroniser = joined([0, 1])
+    synchroniser.add(frame(0, 10 * MS), 50 * MS)
+    assert synchroniser.next_panorama(50 * MS + PERIOD_NS + DEADLINE_NS) is not None
+    synchroniser.add(frame(1, 9 * MS), 200 * MS)
+    assert synchroniser.next_panorama(10**12) is None
+    assert synchroniser.counters.late == synchroniser.late(1) == 1
+
+
+def test_a_frame_from_the_future_is_refused_and_counted() -> None:
+    synchroniser = joined([0])
+    synchroniser.add(frame(0, 5_000 * MS), 10 * MS)
+    assert synchroniser.next_panorama(10**12) is None
+    assert synchroniser.counters.implausible == 1
+
+
+def test_a_camera_that_left_is_named_missing_but_not_waited_for() -> None:
+    synchroniser = joined([0, 1])
+    synchroniser.camera_left(1)
+    synchroniser.add(frame(0, 10 * MS), 50 * MS)
+    panorama = synchroniser.next_panorama(50 * MS)
+    assert panorama is not None
+    assert panorama.missing == (1,)
+
+
+def test_an_expected_camera_that_never_joined_is_named_missing_but_not_waited_for() -> None:
+    synchroniser = Synchroniser([0, 7], deadline_ns=DEADLINE_NS)
+    synchroniser.camera_joined(0, 30.0)
+    synchroniser.add(frame(0, 10 * MS), 50 * MS)
+    panorama = synchroniser.next_panorama(50 * MS)
+    assert panorama is not None
+    assert panorama.missing == (7,)
+
+
+def test_a_camera_that_joins_an_open_rig_is_in_the_sets_from_then_on() -> None:
+    synchroniser = joined([])
+    synchroniser.camera_joined(3, 30.0)
+    synchroniser.camera_joined(5, 30.0)
+    delivered = run(synchroniser, stream(3, 0, 20) + stream(5, 7 * MS, 20))
+    assert all(panorama.complete and set(panorama.frames) == {3, 5} for _, panorama in delivered)
+    assert len(delivered) == 20
+
+
+def test_cameras_that_start_at_different_times_end_up_in_complete_sets_without_lag() -> None:
+    synchroniser = joined(range(3))
+    starts = {0: 0, 1: 5 * PERIOD_NS + 3 * MS, 2: 9 * PERIOD_NS + 11 * MS}
+    arrivals = [item for i, start in starts.items() for item in stream(i, start, 60)]
+    delivered = run(synchroniser, arrivals)
+    settled = [(now, p) for now, p in delivered if 15 * PERIOD_NS < p.timestamp_ns < 60 * PERIOD_NS]
+    assert len(settled) == pytest.approx(45, abs=1)
+    assert all(panorama.complete for _, panorama in settled)
+    assert all(now - panorama.timestamp_ns < 40 * MS + PERIOD_NS for now, panorama in settled)
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_twelve_random_phases_give_complete_sets_at_the_tightest_spread(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    phases = rng.integers(0, PERIOD_NS, 12).tolist()
+    arrivals = [item for i, phase in enumerate(phases) for item in stream(i, phase, 60)]
+    delivered = [panorama for _, panorama in run(joined(range(12)), arrivals)]
+    settled = delivered[3:-3]
+    assert len(settled) >= 60 - 8
+    assert all(panorama.complete for panorama in settled)
+    # The hysteresis of the cut is 5 % of a period.
+    assert max(p.spread_ns for p in settled) <= tightest_spread_ns(phases) + 0.05 * PERIOD_NS
+
+
+def test_the_expected_spread_of_twelve_free_running_kinects_is_25_to_28_ms() -> None:
+    rng = np.random.default_rng(7)
+    means = []
+    for _ in range(30):
+        phases = rng.integers(0, PERIOD_NS, 12).tolist()
+        arrivals = [item for i, phase in enumerate(phases) for item in stream(i, phase, 12)]
+        panoramas = [panorama for _, panorama in run(joined(range(12)), arrivals) if panorama.complete]
+        means.append(panoramas[-1].spread_ns / MS)
+    assert 23 < np.mean(means) < 28
+
+
+def test_a_camera_that_slides_by_a_frame_costs_one_frame_of_itself() -> None:
+    fast_ns = PERIOD_NS - 100_000  # gains a period in 333 frames
+    arrivals = stream(0, 0, 600) + stream(1, 10 * MS, 600) + stream(2, 20 * MS, 602, fast_ns)
+    synchroniser = joined(range(3))
+    delivered = [panorama for _, panorama in run(synchroniser, arrivals)]
+    steady = delivered[2:-4]
+    assert sum(not panorama.complete for panorama in steady) == 0
+    assert max(panorama.spread_ns for panorama in steady) < PERIOD_NS
+    assert synchroniser.counters.skipped <= 6
+
+
+def test_a_slow_camera_is_missing_from_one_set_each_time_it_slides_by_a_frame() -> None:
+    slow_ns = PERIOD_NS + 100_000
+    arrivals = stream(0, 0, 600) + stream(1, 10 * MS, 600) + stream(2, 20 * MS, 598, slow_ns)
+    delivered = [panorama for _, panorama in run(joined(range(3)), arrivals)]
+    steady = delivered[2:-4]
+    assert [p.missing for p in steady if not p.complete] == [(2,)] * sum(not p.complete for p in steady)
+    assert 1 <= sum(not panorama.complete for panorama in steady) <= 3
+
+
+def test_a_lost_frame_leaves_one_partial_set_and_the_next_sets_complete() -> None:
+    arrivals = [item for i in range(4) for item in stream(i, i * 5 * MS, 30)]
+    lost = [(now, f) for now, f in arrivals if not (f.camera_id == 2 and f.sequence == 10)]
+    delivered = [panorama for _, panorama in run(joined(range(4)), lost)]
+    assert [panorama.missing for panorama in delivered if not panorama.complete] == [(2,)]
+    assert len(delivered) == 30
+
+
+def test_a_narrow_spread_limit_splits_what_does_not_fit() -> None:
+    arrivals = stream(0, 0, 10) + stream(1, 12 * MS, 10)
+    delivered = [p for _, p in run(joined(range(2), max_spread_ns=5 * MS), arrivals)]
+    assert all(panorama.spread_ns <= 5 * MS for panorama in delivered)
+    assert sum(len(p.frames) - len(p.missing) for p in delivered) == 20
+
+
+def test_a_silent_camera_bounds_the_queues_and_does_not_stop_the_sets() -> None:
+    synchroniser = Synchroniser(range(2), deadline_ns=10_000 * MS)
+    for camera_id in range(2):
+        synchroniser.camera_joined(camera_id, 30.0)
+    delivered = run(synchroniser, stream(0, 0, 100), until_ns=0)
+    assert len(delivered) == 100 - MAX_PENDING + 1
+    assert synchroniser.counters.skipped == 0
+
+
+def test_frames_that_nobody_collects_are_bounded_and_counted() -> None:
+    synchroniser = joined([0, 1])
+    for now_ns, item in stream(0, 0, 100):
+        synchroniser.add(item, now_ns)
+    assert synchroniser.counters.skipped == 100 - MAX_PENDING
+
+
+arrival_lists = st.lists(
+    st.tuples(
+        st.integers(0, 4),  # camera
+        st.integers(0, 1_000),  # exposure, ms
+        st.integers(-50, 400),  # delay, ms: negative is a clock ahead of the rig's
+    ),
+    max_size=120,
+)
+
+
+@settings(max_examples=150, deadline=None)
+@given(arrival_lists, st.sets(st.integers(0, 4)), st.sampled_from([None, 8 * MS]))
+def test_no_frame_is_used_twice_and_none_vanishes_whatever_arrives(
+    raw: list[tuple[int, int, int]], left: set[int], limit_ns: int | None
+) -> None:
+    synchroniser = Synchroniser(range(4), deadline_ns=DEADLINE_NS, max_spread_ns=limit_ns)
+    for camera_id in set(range(5)) - left:
+        synchroniser.camera_joined(camera_id, 30.0)
+    arrivals = [
+        (max(0, (exposure + delay) * MS), frame(camera, exposure * MS, k))
+        for k, (camera, exposure, delay) in enumerate(raw)
+    ]
+    panoramas = [panorama for _, panorama in run(synchroniser, arrivals)]
+    used = [(f.camera_id, f.sequence) for p in panoramas for f in p.frames.values() if f is not None]
+    counters = synchroniser.counters
+    assert len(used) == len(set(used))
+    assert len(used) + counters.late + counters.skipped + counters.implausible == len(arrivals)
+    for panorama in panoramas:
+        times = [f.timestamp_ns for f in panorama.frames.values() if f is not None]
+        assert panorama.spread_ns == max(times) - min(times)
+        assert panorama.spread_ns <= (limit_ns or 1_000 * MS)
+        assert set(range(4)) <= set(panorama.frames)
+        assert all(f is None or f.camera_id == i for i, f in panorama.frames.items())
+    for earlier, later in itertools.pairwise(panoramas):
+        assert later.index == earlier.index + 1
+        for camera_id, f in earlier.frames.items():
+            after = later.frames.get(camera_id)
+            assert f is None or after is None or after.timestamp_ns > f.timestamp_ns
+
+
+@settings(max_examples=60, deadline=None)
+@given(
+    st.lists(st.integers(0, PERIOD_NS - 1), min_size=2, max_size=12),
+    st.sets(st.tuples(st.integers(0, 11), st.integers(0, 29))),
+    st.integers(0, 2**32 - 1),
+)
+def test_no_set_is_wider_than_one_frame_period_under_loss_and_jitter(
+    phases: list[int], lost: set[tuple[int, int]], seed: int
+) -> None:
+    rng = np.random.default_rng(seed)
+    arrivals = [
+        (now + int(rng.integers(0, 30 * MS)), f)
+        for i, phase in enumerate(phases)
+        for now, f in stream(i, phase, 30)
+        if (i, f.sequence) not in lost
+    ]
+    for _, panorama in run(joined(range(len(phases))), arrivals):
+        assert panorama.spread_ns <= PERIOD_NS
