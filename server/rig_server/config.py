@@ -127,8 +127,9 @@ def load_rig_settings(file: Path | None, overrides: Mapping[str, Any] | None = N
 
 
 def parse_address(text: str) -> Address:
-    """HOST:PORT, HOST or :PORT; ValueError says what is wrong with it."""
+    """HOST:PORT, HOST, :PORT or [IPv6]:PORT; ValueError says what is wrong with it."""
     host, _, port_text = text.rpartition(":") if ":" in text else (text, "", str(DEFAULT_PORT))
+    host = host.removeprefix("[").removesuffix("]")
     if not port_text.isdecimal() or not 0 <= int(port_text) <= 65_535:
         raise ValueError(f"{text!r} is not HOST:PORT with a port from 0 to 65535")
     return host or "0.0.0.0", int(port_text)  # noqa: S104  # an empty host means all interfaces, as in `:7400`

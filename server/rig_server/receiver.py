@@ -1,0 +1,228 @@
+"""The receiver: the server's only socket and clock, in a thread of its own around the link.
+
+Linux hands over several datagrams of one sender in one call (UDP_GRO); where the kernel lacks it, each
+call gives one datagram and everything else stays the same.
+"""
+
+import errno
+import logging
+import select
+import socket
+import struct
+import threading
+import time
+from collections.abc import Callable
+from typing import Protocol
+
+from rig_protocol.datagram import DatagramBatch
+from rig_protocol.errors import ConfigurationError, RigError
+from rig_protocol.events import Address, ServerEvent
+
+logger = logging.getLogger(__name__)
+
+# <linux/udp.h>, <asm-generic/socket.h>: Python names none of them.
+_UDP_GRO = 104
+_SO_RXQ_OVFL = 40
+_SO_RCVBUFFORCE = 33
+
+_MAX_RECEIVE = 65_536  # what one recvmsg returns at most, merged or not
+_ANCILLARY_SIZE = 2 * socket.CMSG_SPACE(4)  # the segment size and the drop counter
+_RECEIVES_A_TURN = 64  # before the link's own time-outs get their turn: 4 MB of merged datagrams
+
+
+class Link(Protocol):
+    """What the receiver asks of `rig_protocol.server_link.ServerLink`."""
+
+    def receive_batch(self, batch: DatagramBatch, address: Address, now_ns: int) -> None:
+        """Take datagrams of one sender; the buffer is reused after the call."""
+        ...
+
+    def datagrams_to_send(self, now_ns: int) -> list[tuple[bytes, Address]]:
+        """What to send now."""
+        ...
+
+    def next_timeout_ns(self) -> int | None:
+        """When `handle_timeout` is due."""
+        ...
+
+    def handle_timeout(self, now_ns: int) -> None:
+        """Time has come."""
+        ...
+
+    def next_event(self) -> ServerEvent | None:
+        """The next event, or None."""
+        ...
+
+    def close(self, now_ns: int) -> None:
+        """Say goodbye to every camera."""
+        ...
+
+
+class Receiver:
+    """Binds on construction, runs the link in a thread from `start` to `stop`.
+
+    `on_event` is called on the receiver's thread for every event and must not block. After a failure of
+    the socket the thread ends and `failure` holds the reason.
+    """
+
+    def __init__(
+        self,
+        link: Link,
+        address: Address,
+        on_event: Callable[[ServerEvent], None],
+        receive_buffer_bytes: int,
+        use_gro: bool = True,
+    ) -> None:
+        self._link = link
+        self._on_event = on_event
+        self._socket = _bound_socket(address)
+        self.receive_buffer_bytes = _ask_for_buffer(self._socket, receive_buffer_bytes)
+        self.merges = use_gro and _switch_on(self._socket, socket.IPPROTO_UDP, _UDP_GRO)
+        self.counts_drops = _switch_on(self._socket, socket.SOL_SOCKET, _SO_RXQ_OVFL)
+        self.kernel_drops = 0  # datagrams that found the socket's buffer full
+        self.unsent = 0  # control datagrams that the network refused
+        self.failure: Exception | None = None
+        self._buffer = bytearray(_MAX_RECEIVE)
+        self._wake_receiver, self._waker = socket.socketpair()
+        self._stopping = threading.Event()
+        self._thread = threading.Thread(target=self._run, name="receiver", daemon=True)
+
+    @property
+    def address(self) -> Address:
+        """Where the socket is bound; the port is the real one when 0 was asked for."""
+        host, port = self._socket.getsockname()[:2]
+        return str(host), int(port)
+
+    def start(self) -> None:
+        """Start receiving."""
+        self._thread.start()
+
+    def stop(self) -> None:
+        """Say goodbye to the cameras and close the socket; harmless when already stopped."""
+        self._stopping.set()
+        if self._thread.is_alive():
+            self._waker.send(b"\0")
+            self._thread.join()
+        for each in (self._socket, self._waker, self._wake_receiver):
+            each.close()
+
+    def _run(self) -> None:
+        poller = select.poll()
+        poller.register(self._socket, select.POLLIN)
+        poller.register(self._wake_receiver, select.POLLIN)
+        try:
+            while not self._stopping.is_set():
+                poller.poll(self._timeout_ms())
+                self._receive_some()
+                self._serve_link()
+            self._link.close(time.monotonic_ns())
+            self._transmit()
+        except Exception as error:  # whatever ends this thread must reach the program
+            logger.exception("the receiver stopped")
+            self.failure = error
+
+    def _timeout_ms(self) -> float | None:
+        due_ns = self._link.next_timeout_ns()
+        return None if due_ns is None else max(0.0, (due_ns - time.monotonic_ns()) / 1e6)
+
+    def _receive_some(self) -> None:
+        for _ in range(_RECEIVES_A_TURN):
+            try:
+                size, ancillary, _, address = self._socket.recvmsg_into([self._buffer], _ANCILLARY_SIZE)
+            except BlockingIOError:
+                return
+            except ConnectionError:  # an agent's host told us that nobody listens there any more
+                continue
+            now_ns = time.monotonic_ns()
+            segment_size = size
+            for level, kind, data in ancillary:
+                if level == socket.IPPROTO_UDP and kind == _UDP_GRO:
+                    segment_size = _leading_int(data)
+                elif level == socket.SOL_SOCKET and kind == _SO_RXQ_OVFL:
+                    self.kernel_drops = _leading_int(data)
+            if size:
+                batch = DatagramBatch(memoryview(self._buffer)[:size], segment_size)
+                self._link.receive_batch(batch, address[:2], now_ns)
+                self._deliver_events()
+
+    def _serve_link(self) -> None:
+        due_ns, now_ns = self._link.next_timeout_ns(), time.monotonic_ns()
+        if due_ns is not None and due_ns <= now_ns:
+            self._link.handle_timeout(now_ns)
+        self._deliver_events()
+        self._transmit()
+
+    def _deliver_events(self) -> None:
+        while (event := self._link.next_event()) is not None:
+            self._on_event(event)
+
+    def _transmit(self) -> None:
+        for datagram, address in self._link.datagrams_to_send(time.monotonic_ns()):
+            try:
+                self._socket.sendto(datagram, address)
+            except OSError as error:  # the route to one agent is no reason to stop for the others
+                self.unsent += 1
+                logger.debug("control datagram to %s was not sent: %s", address, error)
+
+
+def _bound_socket(address: Address) -> socket.socket:
+    host, port = address
+    try:
+        family, kind, protocol, _, where = socket.getaddrinfo(
+            host, port, type=socket.SOCK_DGRAM, flags=socket.AI_PASSIVE
+        )[0]
+    except socket.gaierror as error:
+        raise ConfigurationError(f"listen address {host!r} is not known: {error.strerror}") from error
+    bound = socket.socket(family, kind | socket.SOCK_NONBLOCK, protocol)
+    try:
+        bound.bind(where)
+    except OSError as error:
+        bound.close()
+        raise _bind_error(error, host, port) from error
+    return bound
+
+
+def _bind_error(error: OSError, host: str, port: int) -> RigError:
+    if error.errno == errno.EADDRINUSE:
+        return RigError(
+            f"UDP port {port} is in use: stop the other rig-server "
+            f"(`systemctl stop rig-server`, `ss -ulpn sport = :{port}`) or choose another with --listen"
+        )
+    if error.errno == errno.EADDRNOTAVAIL:
+        return ConfigurationError(f"no interface of this machine has address {host}: see `ip addr`")
+    return ConfigurationError(f"cannot listen on {host}:{port}: {error.strerror}")
+
+
+def _ask_for_buffer(bound: socket.socket, wanted: int) -> int:
+    """Ask for a receive buffer; the size that the kernel granted, with a warning when it is smaller."""
+    bound.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, wanted)
+    if _granted(bound) < wanted:
+        try:
+            bound.setsockopt(socket.SOL_SOCKET, _SO_RCVBUFFORCE, wanted)  # with CAP_NET_ADMIN
+        except OSError:
+            logger.warning(
+                "the kernel grants a receive buffer of %d KiB instead of %d KiB; bursts may lose datagrams: "
+                "sudo sysctl -w net.core.rmem_max=%d",
+                _granted(bound) // 1024,
+                wanted // 1024,
+                wanted,
+            )
+    return _granted(bound)
+
+
+def _granted(bound: socket.socket) -> int:
+    """The kernel doubles what was asked for to hold its own book-keeping, and reports the double."""
+    return bound.getsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF) // 2
+
+
+def _switch_on(bound: socket.socket, level: int, option: int) -> bool:
+    try:
+        bound.setsockopt(level, option, 1)
+    except OSError:
+        return False
+    return True
+
+
+def _leading_int(data: bytes) -> int:
+    """Native unsigned 32-bit value at the front of ancillary data."""
+    return int(struct.unpack_from("=I", data)[0])

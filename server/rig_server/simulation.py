@@ -1,0 +1,150 @@
+"""A ring of simulated agents on this machine: separate processes that stream over real loopback UDP."""
+
+import ctypes
+import os
+import signal
+import subprocess
+import sys
+import tempfile
+from collections.abc import Mapping
+from pathlib import Path
+from types import TracebackType
+from typing import Self
+
+from rig_protocol.errors import RigError
+from rig_protocol.events import Address
+from rig_protocol.poses import Pose
+from rig_protocol.rig_folder import RingDrawing, read_true_poses, write_true_poses
+
+_libc = ctypes.CDLL(None, use_errno=True)  # loaded here: nothing may be loaded between fork and exec
+_PR_SET_PDEATHSIG = 1
+
+_NICENESS = 10  # real agents run on other machines: these must not starve the server's receive path
+_STOP_TIMEOUT_S = 5.0
+_LOG_LINES = 15
+_FULL_STEP_DEG = 30.0
+
+
+class Simulation:
+    """Starts `cameras` agents that stream to `server`; the context manager's end ends all of them.
+
+    Should this process die in any way, the kernel ends the agents. They die with the thread that
+    started them, so start a simulation on a thread that outlives it.
+    """
+
+    def __init__(self, cameras: int, seed: int, fps: float, server: Address) -> None:
+        self._cameras = cameras
+        self._seed = seed
+        self._fps = fps
+        self._server = server
+        self._folder = tempfile.TemporaryDirectory(prefix="rig-simulation-")
+        self._agents: dict[int, subprocess.Popen[bytes]] = {}
+
+    @property
+    def ring(self) -> RingDrawing:
+        """The drawing that the simulated ring was built after, with its mounting tolerances."""
+        return RingDrawing(yaw_step_deg=min(_FULL_STEP_DEG, 360.0 / self._cameras))
+
+    def __enter__(self) -> Self:
+        """Start the agents."""
+        try:
+            for camera_id in range(self._cameras):
+                self._agents[camera_id] = self._start(camera_id)
+        except BaseException:
+            self.close()
+            raise
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        """End the agents."""
+        self.close()
+
+    def check(self) -> None:
+        """RigError with the end of its log when an agent has died."""
+        for camera_id, agent in self._agents.items():
+            if (status := agent.poll()) is not None:
+                raise RigError(
+                    f"simulated agent {camera_id} ended with status {status}; the end of its log:\n"
+                    + self._log_tail(camera_id)
+                )
+
+    def true_poses(self) -> dict[int, Pose]:
+        """True T_rig_camera by camera id, which the agents wrote when they started."""
+        poses: dict[int, Pose] = {}
+        for camera_id in range(self._cameras):
+            poses |= read_true_poses(self._truth_file(camera_id))
+        return poses
+
+    def write_truth(self, path: Path) -> Mapping[int, Pose]:
+        """Write `truth.json` of the whole ring; what was written."""
+        poses = self.true_poses()
+        write_true_poses(path, poses)
+        return poses
+
+    def close(self) -> None:
+        """End all agents and remove their files; harmless when already closed."""
+        for agent in self._agents.values():
+            agent.terminate()
+        for agent in self._agents.values():
+            try:
+                agent.wait(_STOP_TIMEOUT_S)
+            except subprocess.TimeoutExpired:
+                agent.kill()
+                agent.wait()
+        self._agents.clear()
+        self._folder.cleanup()
+
+    def _start(self, camera_id: int) -> subprocess.Popen[bytes]:
+        host, port = self._server
+        options = {
+            "--config": self._empty_config(),
+            "--source": "synthetic",
+            "--camera": camera_id,
+            "--cameras": self._cameras,
+            "--seed": self._seed,
+            "--fps": self._fps,
+            "--server": f"{host}:{port}",
+            "--truth-out": self._truth_file(camera_id),
+        }
+        words = [str(word) for option in options.items() for word in option]
+        with self._log_file(camera_id).open("wb") as log:
+            return subprocess.Popen(  # noqa: S603  # our own program, arguments are ours
+                [sys.executable, "-m", "rig_agent.cli", *words],
+                stdin=subprocess.DEVNULL,
+                stdout=log,
+                stderr=subprocess.STDOUT,
+                env=_environment(),
+                start_new_session=True,  # Ctrl-C is for this program; it ends the agents in order
+                preexec_fn=_become_agent,  # noqa: PLW1509  # only system calls happen in it
+            )
+
+    def _empty_config(self) -> Path:
+        """Keeps the agents from reading the settings of a real agent on this machine."""
+        path = Path(self._folder.name) / "agent.toml"
+        path.touch()
+        return path
+
+    def _truth_file(self, camera_id: int) -> Path:
+        return Path(self._folder.name) / f"truth{camera_id:02d}.json"
+
+    def _log_file(self, camera_id: int) -> Path:
+        return Path(self._folder.name) / f"agent{camera_id:02d}.log"
+
+    def _log_tail(self, camera_id: int) -> str:
+        text = self._log_file(camera_id).read_text(errors="replace")
+        return "\n".join(text.splitlines()[-_LOG_LINES:]) or "(empty)"
+
+
+def _become_agent() -> None:
+    """Between fork and exec: end when the parent ends, and leave the processor to the server."""
+    _libc.prctl(_PR_SET_PDEATHSIG, signal.SIGTERM)
+    os.nice(_NICENESS)
+
+
+def _environment() -> dict[str, str]:
+    """Ours without a real agent's settings; the processes share the cores, so one thread for each."""
+    kept = {name: value for name, value in os.environ.items() if not name.startswith("RIG_AGENT_")}
+    threads = dict.fromkeys(("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "OPENCV_FOR_THREADS_NUM"), "1")
+    return kept | threads
