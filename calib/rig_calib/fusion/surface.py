@@ -47,6 +47,26 @@ class Surface:
     colors: ImageU8
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class DepthBuffer:
+    """Nearest depth (rows, columns) in each cell of a colour image: what hides what from the camera."""
+
+    nearest_m: Array
+
+    @classmethod
+    def of(cls, color_pixels: Array, depth_m: npt.NDArray[np.floating]) -> "DepthBuffer":
+        """The buffer of points at pixels (N,2) with depths (N,)."""
+        cells = _cells(color_pixels)
+        nearest = np.full(cells.max(axis=0, initial=0) + 1, np.inf)
+        np.minimum.at(nearest, (cells[:, 0], cells[:, 1]), depth_m)
+        return cls(nearest)
+
+    def visible(self, color_pixels: Array, depth_m: Array) -> Mask:
+        """Which points (N,) no other is clearly in front of."""
+        cells = np.minimum(_cells(color_pixels), np.array(self.nearest_m.shape) - 1)
+        return np.asarray(depth_m < self.nearest_m[cells[:, 0], cells[:, 1]] * _HIDDEN_RATIO)
+
+
 def camera_surfaces(
     views: Sequence[CameraView], calibration: RigCalibration, frame: int | None = None
 ) -> tuple[list[Surface], tuple[str, ...]]:
@@ -60,11 +80,17 @@ def camera_surfaces(
         camera = calibration.camera(view.camera_id)
         if camera is None:
             skipped.append(f"{view.name}: left out, the calibration could not place it")
-        elif not _frames(view, frame):
+        elif not frames_of(view, frame):
             skipped.append(f"{view.name}: left out, it delivered no colour with depth")
         else:
             surfaces.append(camera_surface(view, camera.depth_correction, frame))
     return surfaces, tuple(skipped)
+
+
+def frames_of(view: CameraView, frame: int | None) -> list[int]:
+    """Indices of the frames to use: those that hold colour and depth, or only the one asked for."""
+    count = min(len(view.color), max(len(view.raw), len(view.depth_mm)))
+    return [k for k in range(count) if frame is None or k == frame]
 
 
 def camera_surface(
@@ -74,7 +100,7 @@ def camera_surface(
 
     Flying points at edges of depth, speckle, and points whose colour is hidden are left out.
     """
-    frames = _frames(view, frame)
+    frames = frames_of(view, frame)
     if not frames:
         raise ValueError(f"{view.name} has no colour with depth in frame {frame}")
     grid = depth_grid(view.model, view.depth_frame)
@@ -158,11 +184,6 @@ def sample_colors(image: Array32, pixels: Array) -> ImageU8:
     return np.asarray(colors, dtype=np.uint8)
 
 
-def _frames(view: CameraView, frame: int | None) -> list[int]:
-    count = min(len(view.color), max(len(view.raw), len(view.depth_mm)))
-    return [k for k in range(count) if frame is None or k == frame]
-
-
 def _solid(disparity: Array, incidence: Array) -> Mask:
     steep = ~(incidence > np.cos(np.deg2rad(_MAX_INCIDENCE_DEG)))
     edges = depth_edges(disparity) | steep
@@ -174,10 +195,8 @@ def _solid(disparity: Array, incidence: Array) -> Mask:
 
 
 def _unhidden(color_pixels: Array, depth_m: Array) -> Mask:
-    """Which points the colour camera sees: no other point in their cell is clearly nearer."""
-    cells = np.rint(color_pixels / _OCCLUSION_CELL_PX).astype(np.intp)
-    width = int(cells[:, 0].max(initial=0)) + 1
-    index = cells[:, 1] * width + cells[:, 0]
-    nearest = np.full(int(index.max(initial=0)) + 1, np.inf)
-    np.minimum.at(nearest, index, depth_m)
-    return np.asarray(depth_m < nearest[index] * _HIDDEN_RATIO)
+    return DepthBuffer.of(color_pixels, depth_m).visible(color_pixels, depth_m)
+
+
+def _cells(color_pixels: Array) -> npt.NDArray[np.intp]:
+    return np.maximum(np.rint(color_pixels[:, ::-1] / _OCCLUSION_CELL_PX), 0).astype(np.intp)
