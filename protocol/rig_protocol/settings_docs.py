@@ -98,7 +98,7 @@ def _commented_lines(model: type[BaseModel], defaults: Mapping[str, Any], prefix
         shown = defaults[name]
         if shown is None:
             yield f"# {_default_text(field, None).capitalize()}; allowed: {_type_text(field)}. For example:"
-            shown = field.examples[0] if field.examples else ""
+            shown = _example(field)
         # An empty table means its model's defaults, so a default that its parent changed stays active.
         mark = "#" if defaults[name] == own[name] else ""
         yield from (f"{mark}{name} = {_toml_value(shown)}", "")
@@ -163,6 +163,14 @@ def _toml_character(character: str) -> str:
 
 
 # ---- words
+
+
+def _example(field: FieldInfo) -> Any:
+    """The field's first example, else an empty value of its type."""
+    if field.examples:
+        return field.examples[0]
+    kinds = (field.annotation, *get_args(field.annotation))
+    return next((kind() for kind in kinds if kind in (bool, int, float)), "")
 
 
 def _default_text(field: FieldInfo, default: Any) -> str:

@@ -1,0 +1,109 @@
+"""Settings of `rig-agent`: `agent.toml`, environment `RIG_AGENT_*` and the command line."""
+
+import platform
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, Literal
+
+from pydantic import Field, field_validator
+
+from rig_agent.simulator.settings import SimulatorSettings
+from rig_protocol.datagram import DEFAULT_DATAGRAM_SIZE, MAX_DATAGRAM_SIZE, MIN_DATAGRAM_SIZE
+from rig_protocol.errors import ConfigurationError
+from rig_protocol.events import Address
+from rig_protocol.settings import Settings, load_settings
+
+ENVIRONMENT_PREFIX = "RIG_AGENT_"
+CONFIG_PLACES = (Path("agent.toml"), Path("/etc/kinect-rig/agent.toml"))
+DEFAULT_PORT = 7400
+
+SourceName = Literal["freenect", "folder", "synthetic"]
+
+
+class FolderSettings(Settings):
+    """A recorded rig folder, one camera of it."""
+
+    path: Path | None = Field(None, examples=[Path("recordings/office")])
+    """Folder that holds nominal.json and one subfolder a camera."""
+    camera: int | str | None = Field(None, examples=["cam00"])
+    """Camera of the folder, by id or name; unset: the agent's own slot `camera`."""
+
+
+class PacingSettings(Settings):
+    """How a frame's datagrams are spread in time, so that twelve agents do not overflow one switch port."""
+
+    spread: float = Field(0.8, ge=0, le=1)
+    """Share of the frame interval to send a frame over; 0 sends it at once."""
+    burst: int = Field(8, ge=1, le=44)
+    """Datagrams sent together."""
+
+
+class AgentSettings(Settings):
+    """Settings of rig-agent. Remove the # before a key to change it; shown are the defaults."""
+
+    server: str = Field("127.0.0.1:7400", examples=["rig-server.local:7400"])
+    """Where rig-server listens: HOST:PORT or HOST."""
+    source: SourceName = "freenect"
+    """Where frames come from: a Kinect, a recorded rig folder or the simulator."""
+    camera: int | None = Field(None, ge=0, lt=64, examples=[0])
+    """Slot of this camera in the ring; unset: the server knows it by serial number or USB port."""
+    name: str | None = Field(None, min_length=1, max_length=64, examples=["cam00"])
+    """Name that the operator sees; unset: cam00, cam01, ... after the slot, else this machine's name."""
+    fps: float | None = Field(None, gt=0, le=120, examples=[30.0])
+    """Frames a second to send; unset: as many as the source delivers (a folder: 30)."""
+    color: Literal["lossless", "jpeg", "raw"] = "lossless"
+    """How colour travels: losslessly compressed, as JPEG, or uncompressed. The server may refuse JPEG."""
+    depth: Literal["lossless", "raw"] = "lossless"
+    """How depth travels: losslessly compressed or uncompressed."""
+    datagram_size: int = Field(DEFAULT_DATAGRAM_SIZE, ge=MIN_DATAGRAM_SIZE, le=MAX_DATAGRAM_SIZE)
+    """Largest UDP payload in bytes: the path's MTU minus 28 (jumbo frames: 8972)."""
+    report_interval_s: float = Field(10.0, ge=1, le=3600)
+    """How often one line in the log tells rates, drops and reconnects."""
+    log_level: Literal["DEBUG", "INFO", "WARNING", "ERROR"] = "INFO"
+    """What is worth a line in the log."""
+    pacing: PacingSettings = PacingSettings()
+    """How frames are spread in time."""
+    folder: FolderSettings = FolderSettings()
+    """Options of `source = "folder"`."""
+    synthetic: SimulatorSettings = SimulatorSettings()
+    """Options of `source = "synthetic"`: the simulated rig; `camera` is the one that this agent plays."""
+
+    @field_validator("server")
+    @classmethod
+    def _server_is_an_address(cls, text: str) -> str:
+        _parse_address(text)
+        return text
+
+    @property
+    def address(self) -> Address:
+        """`server` as (host, port)."""
+        return _parse_address(self.server)
+
+    def display_name(self, slot: int | None) -> str:
+        """The name, or the one that follows from the slot, or from the machine."""
+        if self.name is not None:
+            return self.name
+        return platform.node()[:64] if slot is None else f"cam{slot:02d}"
+
+
+def load_agent_settings(file: Path | None, overrides: Mapping[str, Any] | None = None) -> AgentSettings:
+    """Settings from `file`, else ./agent.toml, else /etc/kinect-rig/agent.toml, else the defaults.
+
+    ConfigurationError names the wrong key, and an option that is missing for the chosen source.
+    """
+    found = file or next((place for place in CONFIG_PLACES if place.is_file()), None)
+    settings = load_settings(AgentSettings, found, ENVIRONMENT_PREFIX, overrides)
+    if settings.source == "folder" and settings.folder.path is None:
+        raise ConfigurationError("source folder needs a folder: give --path, or `path` in [folder]")
+    return settings
+
+
+def _parse_address(text: str) -> Address:
+    """HOST:PORT, HOST or [IPv6]:PORT; ValueError says what is wrong with it."""
+    host, colon, port = text.rpartition(":")
+    if not colon or text.endswith("]"):
+        host, port = text, str(DEFAULT_PORT)
+    host = host.removeprefix("[").removesuffix("]")
+    if not host or not port.isdecimal() or not 0 < int(port) <= 65_535:
+        raise ValueError(f"{text!r} is not HOST or HOST:PORT with a port from 1 to 65535")
+    return host, int(port)
