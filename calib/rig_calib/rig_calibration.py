@@ -142,6 +142,11 @@ class RigCalibration:
     warnings: tuple[str, ...] = ()
     failures: tuple[str, ...] = ()
 
+    @property
+    def poses(self) -> dict[int, Pose]:
+        """T_rig_camera by camera id, of every camera that could be placed."""
+        return {camera.id: camera.T_rig_camera for camera in self.cameras}
+
     def camera(self, camera_id: int) -> CalibratedCamera | None:
         """The camera with this id, or None when the calibration could not place it."""
         return next((camera for camera in self.cameras if camera.id == camera_id), None)
