@@ -9,12 +9,12 @@ import numpy.typing as npt
 Array = npt.NDArray[np.float64]
 Array32 = npt.NDArray[np.float32]
 
-_MAX_SLOPE = float(np.tan(np.deg2rad(60.0)))  # what is farther from the horizon stretches without end
+_MAX_SLOPE = float(np.tan(np.deg2rad(55.0)))  # what is farther from the horizon stretches without end
 _MAX_HEIGHT_PX = 4096
 _GAP_BINS = 360
 _MIN_GAP_BINS = 20  # degrees that no camera covers before the panorama is cut open there
 _BEHIND_RATIO = 1.05  # a point this much farther than the nearest of its cell lies behind it
-_FILL_ROUNDS, _FILL_NEIGHBOURS, _FILL_RATIO = 4, 3, 1.04  # holes up to 8 px, neighbours within 4 %
+_HOLE_PX, _FILL_RATIO = 7, 1.04  # holes narrower than this, between neighbours within 4 %
 
 
 @dataclass(frozen=True, slots=True)
@@ -52,10 +52,10 @@ class Cylinder:
 
 
 def fit_cylinder(points: Array, circle_px: int) -> Cylinder:
-    """The grid that shows points (N,3) of the view frame, `circle_px` columns for a full circle."""
+    """The grid that shows points (N,3), N > 0, of the view frame, `circle_px` columns for a full circle."""
     pixels_per_rad = circle_px / (2 * np.pi)
     azimuth, slope, _ = _cylindrical(points)
-    low, high = np.percentile(slope, (0.2, 99.8)) if len(slope) else (-0.5, 0.5)
+    low, high = np.percentile(slope, (0.2, 99.8)).clip(-_MAX_SLOPE, _MAX_SLOPE)
     height = int(np.clip((high - low) * pixels_per_rad, 1, _MAX_HEIGHT_PX))
     left, covered = _covered_azimuths(azimuth)
     return Cylinder(max(1, round(covered * pixels_per_rad)), height, pixels_per_rad, left, float(high))
@@ -83,17 +83,18 @@ def splat_distance(cylinder: Cylinder, points: Array, sigma_m: Array32) -> Array
 
 def fill_small_holes(distance: Array32, closed: bool) -> Array32:
     """The image with holes of a few pixels filled where the neighbours agree on a surface."""
-    margin = 2 * _FILL_ROUNDS
+    margin = _HOLE_PX
     image = _wrap(distance, margin, closed)
-    kernel = np.ones((3, 3), np.uint8)
-    for _ in range(_FILL_ROUNDS):
+    kernel, neighbours = np.ones((_HOLE_PX, _HOLE_PX), np.uint8), np.ones((3, 3), np.uint8)
+    enclosed = cv2.morphologyEx(np.isfinite(image).astype(np.uint8), cv2.MORPH_CLOSE, kernel) > 0
+    for _ in range(_HOLE_PX // 2):
         known = np.isfinite(image)
+        values = np.where(known, image, np.float32(0))
+        farthest = cv2.dilate(values, neighbours)
+        nearest = cv2.erode(np.where(known, image, np.float32(np.inf)), neighbours)
+        fill = ~known & enclosed & (farthest > 0) & (farthest / _FILL_RATIO < nearest)
         count = cv2.boxFilter(known.astype(np.float32), -1, (3, 3), normalize=False)
-        total = cv2.boxFilter(np.where(known, image, 0), -1, (3, 3), normalize=False)
-        farthest = cv2.dilate(np.where(known, image, 0), kernel)
-        nearest = cv2.erode(np.where(known, image, np.float32(np.inf)), kernel)
-        fill = ~known & (count >= _FILL_NEIGHBOURS) & (farthest < _FILL_RATIO * nearest)
-        image[fill] = total[fill] / count[fill]
+        image[fill] = (cv2.boxFilter(values, -1, (3, 3), normalize=False))[fill] / count[fill]
     return np.ascontiguousarray(image[:, margin : image.shape[1] - margin])
 
 
@@ -129,18 +130,15 @@ def _wrap(image: Array32, margin: int, closed: bool) -> Array32:
 
 
 def _cylindrical(points: Array) -> tuple[Array, Array, Array]:
-    """Azimuth, slope and distance from the axis of the points near enough to the horizon; others are far off."""
+    """Azimuth, slope and distance from the axis (N,) each."""
     distance = np.maximum(np.hypot(points[:, 0], points[:, 1]), 1e-9)
-    slope = np.clip(points[:, 2] / distance, -_MAX_SLOPE, _MAX_SLOPE)
-    return np.arctan2(points[:, 1], points[:, 0]), slope, distance
+    return np.arctan2(points[:, 1], points[:, 0]), points[:, 2] / distance, distance
 
 
 def _covered_azimuths(azimuth: Array) -> tuple[float, float]:
     """Azimuth of the left border and the angle covered from there to the right, rad."""
     bins = np.floor(np.mod(azimuth, 2 * np.pi) * (_GAP_BINS / (2 * np.pi))).astype(np.intp) % _GAP_BINS
     occupied = np.flatnonzero(np.bincount(bins, minlength=_GAP_BINS))
-    if not len(occupied):
-        return np.pi, 2 * np.pi
     gaps = np.diff(occupied, append=occupied[0] + _GAP_BINS) - 1
     widest = int(np.argmax(gaps))
     if gaps[widest] < _MIN_GAP_BINS:

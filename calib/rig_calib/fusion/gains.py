@@ -10,7 +10,7 @@ import numpy as np
 
 from rig_calib.fusion.surface import Surface
 from rig_calib.fusion.voxels import Array, Keys, sum_by_key, voxel_keys
-from rig_protocol.poses import Pose, transform_points
+from rig_protocol.poses import Pose
 
 Gain = Array
 
@@ -47,7 +47,7 @@ def color_gains(surfaces: Sequence[Surface], poses: Mapping[int, Pose]) -> dict[
 
 
 def _cell_colors(surface: Surface, T_rig_camera: Pose) -> tuple[Keys, Array]:
-    points = transform_points(T_rig_camera, surface.points_m.astype(np.float64))
+    points = surface.points_at(T_rig_camera)
     counted = np.column_stack([np.ones(len(points)), surface.colors])
     keys, sums = sum_by_key(voxel_keys(points, _CELL_M), counted)
     return keys, sums[:, 1:] / sums[:, :1]

@@ -1,6 +1,6 @@
 """Cylindrical RGB-D panorama around the axis of a rig: colour and distance of all cameras at once."""
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -65,33 +65,31 @@ def render_panorama(
     `frame` picks one panoramic frame, None averages them all. DataError when no camera can contribute.
     """
     surfaces, skipped = camera_surfaces(views, calibration, frame)
+    gains = color_gains(surfaces, calibration.poses) if equalise_colors else {}
+    return render_surfaces(surfaces, views, calibration, gains, frame, circle_px, skipped)
+
+
+def render_surfaces(
+    surfaces: Sequence[Surface],
+    views: Sequence[CameraView],
+    calibration: RigCalibration,
+    gains: Mapping[int, Gain],
+    frame: int | None = None,
+    circle_px: int = DEFAULT_CIRCLE_PX,
+    skipped: tuple[str, ...] = (),
+) -> Panorama:
+    """`render_panorama` of surfaces that are there already; `views` hold their images."""
+    surfaces = [surface for surface in surfaces if len(surface.points_m)]
     if not surfaces:
         raise DataError("no camera has a pose, colour and depth: there is nothing to draw a panorama of")
-    poses = {camera.id: camera.T_rig_camera for camera in calibration.cameras}
-    gains = color_gains(surfaces, poses) if equalise_colors else {}
-    view_poses = _in_view(poses, surfaces, calibration.rig_frame)
-    T_rig_view = poses[surfaces[0].camera_id] @ inverse(view_poses[surfaces[0].camera_id])
-    cylinder, distance = _render_distance(surfaces, view_poses, circle_px)
-    by_id = {view.camera_id: view for view in views}
-    layers = (
-        _Layer(
-            surface,
-            by_id[surface.camera_id],
-            view_poses[surface.camera_id],
-            gains.get(surface.camera_id, NO_GAIN),
-            frame,
-        )
-        for surface in surfaces
-    )
+    used = {surface.camera_id: calibration.poses[surface.camera_id] for surface in surfaces}
+    T_rig_view = rig_viewpoint(used, calibration.rig_frame).T_rig_view
+    poses = {camera_id: inverse(T_rig_view) @ T_rig_camera for camera_id, T_rig_camera in used.items()}
+    cylinder, distance = _render_distance(surfaces, poses, circle_px)
     points = cylinder.rays() * complete(distance, cylinder.closed)[..., None]
-    axes = {surface.name: view_poses[surface.camera_id][:2, 2] for surface in surfaces}
+    layers = _layers(surfaces, views, poses, gains, frame)
     return Panorama(
-        color=_blend(points, layers),
-        depth_m=distance,
-        cylinder=cylinder,
-        T_rig_view=T_rig_view,
-        camera_azimuths_rad={name: float(np.arctan2(axis[1], axis[0])) for name, axis in axes.items()},
-        skipped=skipped,
+        _blend(points, layers), distance, cylinder, T_rig_view, _azimuths(surfaces, poses), skipped
     )
 
 
@@ -115,26 +113,36 @@ class _Layer:
         pixels = project(intrinsics, local)
         seen = inside(intrinsics, pixels, margin_px=-0.5)
         index, local, pixels = index[seen], local[seen], pixels[seen]
-        buffer = DepthBuffer.of(project(intrinsics, self.surface.points_m), self.surface.points_m[:, 2])
+        own = self.surface.points_m.astype(np.float64)
+        buffer = DepthBuffer.of(project(intrinsics, own), own[:, 2])
         hidden = ~buffer.visible(pixels, local[:, 2])
         weight = _centre_weight(intrinsics, pixels) ** _SEAM_POWER * np.where(hidden, _HIDDEN_WEIGHT, 1.0)
         image = mean_color([self.view.color[k] for k in frames_of(self.view, self.frame)])
         return index, (sample_colors(image, pixels) * self.gain).astype(np.float32), weight
 
 
-def _in_view(poses: Mapping[int, Pose], surfaces: Sequence[Surface], rig_frame: str) -> dict[int, Pose]:
-    """Poses T_view_camera of the cameras that contribute."""
-    used = {surface.camera_id: poses[surface.camera_id] for surface in surfaces}
-    T_view_rig = inverse(rig_viewpoint(used, rig_frame).T_rig_view)
-    return {camera_id: T_view_rig @ T_rig_camera for camera_id, T_rig_camera in used.items()}
+def _layers(
+    surfaces: Sequence[Surface],
+    views: Sequence[CameraView],
+    poses: Mapping[int, Pose],
+    gains: Mapping[int, Gain],
+    frame: int | None,
+) -> Iterator[_Layer]:
+    by_id = {view.camera_id: view for view in views}
+    for surface in surfaces:
+        camera_id = surface.camera_id
+        yield _Layer(surface, by_id[camera_id], poses[camera_id], gains.get(camera_id, NO_GAIN), frame)
+
+
+def _azimuths(surfaces: Sequence[Surface], poses: Mapping[int, Pose]) -> dict[str, float]:
+    axes = {surface.name: poses[surface.camera_id][:2, 2] for surface in surfaces}
+    return {name: float(np.arctan2(axis[1], axis[0])) for name, axis in axes.items()}
 
 
 def _render_distance(
-    surfaces: Sequence[Surface], view_poses: Mapping[int, Pose], circle_px: int
+    surfaces: Sequence[Surface], poses: Mapping[int, Pose], circle_px: int
 ) -> tuple[Cylinder, Array32]:
-    points = np.concatenate(
-        [transform_points(view_poses[surface.camera_id], surface.points_m) for surface in surfaces]
-    )
+    points = np.concatenate([surface.points_at(poses[surface.camera_id]) for surface in surfaces])
     sigma = np.concatenate([surface.sigma_m for surface in surfaces])
     cylinder = fit_cylinder(points, circle_px)
     return cylinder, fill_small_holes(splat_distance(cylinder, points, sigma), cylinder.closed)

@@ -10,7 +10,7 @@ from rig_calib.fusion.surface import Surface, camera_surfaces
 from rig_calib.fusion.voxels import Array, Keys, sum_by_key, voxel_keys
 from rig_calib.rig_calibration import RigCalibration
 from rig_calib.view import CameraView
-from rig_protocol.poses import Pose, transform_points
+from rig_protocol.poses import Pose
 
 DEFAULT_VOXEL_M = 0.01
 _COLUMNS = 7  # weight, then weighted x, y, z and weighted red, green, blue
@@ -29,9 +29,8 @@ def fuse_point_cloud(
     cameras' exposures and white balances differ by in their overlaps.
     """
     surfaces, skipped = camera_surfaces(views, calibration, frame)
-    poses = {camera.id: camera.T_rig_camera for camera in calibration.cameras}
-    gains = color_gains(surfaces, poses) if equalise_colors else {}
-    return fuse_surfaces(surfaces, poses, voxel_m, gains, skipped)
+    gains = color_gains(surfaces, calibration.poses) if equalise_colors else {}
+    return fuse_surfaces(surfaces, calibration.poses, voxel_m, gains, skipped)
 
 
 def fuse_surfaces(
@@ -57,7 +56,7 @@ def fuse_surfaces(
 
 
 def _camera_sums(surface: Surface, T_rig_camera: Pose, gain: Gain, voxel_m: float) -> tuple[Keys, Array]:
-    points = transform_points(T_rig_camera, surface.points_m.astype(np.float64))
+    points = surface.points_at(T_rig_camera)
     weight = 1.0 / np.square(surface.sigma_m.astype(np.float64))
     values = np.column_stack([np.ones_like(weight), points, surface.colors * gain])
     return sum_by_key(voxel_keys(points, voxel_m), values * weight[:, None])

@@ -20,6 +20,7 @@ from rig_calib.projection import from_pixels, inside, project
 from rig_calib.rig_calibration import RigCalibration
 from rig_calib.view import CameraView
 from rig_protocol.frames import ImageU8
+from rig_protocol.poses import Pose, transform_points
 
 Array = npt.NDArray[np.float64]
 Array32 = npt.NDArray[np.float32]
@@ -45,6 +46,10 @@ class Surface:
     points_m: Array32
     sigma_m: Array32
     colors: ImageU8
+
+    def points_at(self, T_rig_camera: Pose) -> Array:
+        """The points (N,3) f64 in the rig frame, the camera being at T_rig_camera."""
+        return transform_points(T_rig_camera, self.points_m.astype(np.float64))
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -1,0 +1,107 @@
+"""panorama.png: the colour strip above the depth strip, with a scale in metres and the cameras' places."""
+
+from pathlib import Path
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from rig_calib.fusion.panorama import Panorama
+from rig_protocol.errors import DataError
+from rig_protocol.frames import ImageU8
+
+_BACKGROUND, _INK, _FAINT = (24, 22, 20), (235, 232, 228), (120, 116, 112)  # BGR
+_BORDER_PX, _RULER_PX, _LEGEND_PX = 24, 44, 74
+_FONT, _FONT_SCALE = cv2.FONT_HERSHEY_SIMPLEX, 0.6
+_MIN_WIDTH_PX = 480  # the legend needs this much
+
+
+def write_panorama(path: Path, panorama: Panorama) -> None:
+    """Write the picture, the file whole or not at all."""
+    written, data = cv2.imencode(".png", panorama_picture(panorama))
+    if not written:
+        raise DataError(f"{path}: the panorama could not be encoded as PNG")
+    part = path.with_name(path.name + ".part")
+    part.write_bytes(data.tobytes())
+    part.replace(path)
+
+
+def panorama_picture(panorama: Panorama) -> ImageU8:
+    """The picture (H,W,3), BGR: colour, cameras, depth, scale."""
+    low, high = depth_range_m(panorama.depth_m)
+    strips = (
+        panorama.color,
+        _camera_ruler(panorama),
+        color_depth(panorama.depth_m, low, high),
+        _legend(panorama.cylinder.width, low, high),
+    )
+    width = max(panorama.cylinder.width, _MIN_WIDTH_PX)
+    return np.asarray(_framed(np.concatenate([_widened(strip, width) for strip in strips])), np.uint8)
+
+
+def depth_range_m(depth_m: npt.NDArray[np.float32]) -> tuple[float, float]:
+    """Rounded limits that hold nearly all of a depth image; 0 to 1 m when it is empty."""
+    known = depth_m[np.isfinite(depth_m)]
+    if not len(known):
+        return 0.0, 1.0
+    low, high = np.percentile(known, (0.5, 99.5))
+    low, high = np.floor(low * 2) / 2, np.ceil(high * 2) / 2
+    return float(low), float(max(high, low + 0.5))
+
+
+def color_depth(depth_m: npt.NDArray[np.float32], low_m: float, high_m: float) -> ImageU8:
+    """Depth (H,W) as colours (H,W,3), BGR: warm is near, and nothing is the background."""
+    known = np.isfinite(depth_m)
+    nearness = (high_m - np.where(known, depth_m, high_m)) / (high_m - low_m)
+    image = cv2.applyColorMap((nearness.clip(0, 1) * 255).astype(np.uint8), cv2.COLORMAP_TURBO)
+    image[~known] = _BACKGROUND
+    return np.asarray(image, dtype=np.uint8)
+
+
+def _camera_ruler(panorama: Panorama) -> ImageU8:
+    """Names of the cameras under the columns where they look."""
+    strip = _blank(_RULER_PX, panorama.cylinder.width)
+    for name, azimuth in panorama.camera_azimuths_rad.items():
+        column = round(float(panorama.cylinder.column(np.array(azimuth))))
+        cv2.line(strip, (column, 0), (column, 10), _FAINT, 2)
+        _text_centred(strip, name, column, 32)
+    return strip
+
+
+def _legend(width: int, low_m: float, high_m: float) -> ImageU8:
+    """The colours of depth with a tick every half metre or metre."""
+    strip = _blank(_LEGEND_PX, max(width, _MIN_WIDTH_PX))
+    bar = min(900, strip.shape[1] - 200)
+    left = (strip.shape[1] - bar) // 2
+    ramp = np.linspace(low_m, high_m, bar, dtype=np.float32)
+    strip[16:34, left : left + bar] = color_depth(ramp[None], low_m, high_m)
+    step = 0.5 if high_m - low_m <= 4 else 1.0
+    for metres in np.arange(np.ceil(low_m / step) * step, high_m + 1e-6, step):
+        column = left + round((metres - low_m) / (high_m - low_m) * (bar - 1))
+        cv2.line(strip, (column, 34), (column, 40), _INK, 1)
+        _text_centred(strip, f"{metres:g}", column, 60)
+    cv2.putText(strip, "m", (left + bar + 20, 60), _FONT, _FONT_SCALE, _INK, 1, cv2.LINE_AA)
+    return strip
+
+
+def _blank(height: int, width: int) -> ImageU8:
+    return np.full((height, width, 3), _BACKGROUND, np.uint8)
+
+
+def _text_centred(image: ImageU8, text: str, column: int, baseline: int) -> None:
+    width = cv2.getTextSize(text, _FONT, _FONT_SCALE, 1)[0][0]
+    left = min(max(column - width // 2, 0), image.shape[1] - width)
+    cv2.putText(image, text, (left, baseline), _FONT, _FONT_SCALE, _INK, 1, cv2.LINE_AA)
+
+
+def _widened(strip: ImageU8, width: int) -> ImageU8:
+    missing = width - strip.shape[1]
+    sides = (missing // 2, missing - missing // 2)
+    return np.stack(
+        [np.pad(strip[..., k], ((0, 0), sides), constant_values=_BACKGROUND[k]) for k in range(3)], axis=-1
+    )
+
+
+def _framed(image: ImageU8) -> npt.NDArray[np.uint8]:
+    border = (_BORDER_PX,) * 4
+    return np.asarray(cv2.copyMakeBorder(image, *border, cv2.BORDER_CONSTANT, value=_BACKGROUND))
