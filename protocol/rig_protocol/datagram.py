@@ -157,8 +157,8 @@ def write_fragment_headers(first: FragmentHeader, rows: npt.NDArray[np.uint8]) -
     headers["fragment_index"] += np.arange(len(rows), dtype=np.uint16)
 
 
-def consecutive_runs(batch: DatagramBatch) -> Iterator[memoryview]:
-    """The batch cut into runs of equal-sized datagrams whose headers continue the first one's index.
+def consecutive_runs(batch: DatagramBatch) -> Iterator[tuple[int, memoryview]]:
+    """The batch cut into runs (count, bytes) of equal-sized datagrams whose headers continue the first one's.
 
     Anything that is no fragment, and the shorter last datagram, is a run of its own.
     """
@@ -170,6 +170,6 @@ def consecutive_runs(batch: DatagramBatch) -> Iterator[memoryview]:
         edges = [0, *(np.flatnonzero(~follows) + 1).tolist(), full]
     else:
         edges = list(range(full + 1))
-    yield from (batch.part(start, stop) for start, stop in pairwise(edges))
+    yield from ((stop - start, batch.part(start, stop)) for start, stop in pairwise(edges))
     if full < len(batch):
-        yield batch.part(full, full + 1)
+        yield 1, batch.part(full, full + 1)

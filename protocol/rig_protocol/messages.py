@@ -1,5 +1,6 @@
 """Control messages: what agent and server say to each other beside frames."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from enum import Enum
 
@@ -14,6 +15,7 @@ class RejectReason(Enum):
     DUPLICATE_SLOT = 3
     NO_COMMON_CODEC = 4
     MALFORMED = 5
+    OTHER = 255  # a reason of a later version; the text says it
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -37,10 +39,58 @@ class Hello:
 
 @dataclass(frozen=True, slots=True)
 class Welcome:
-    """The server's choices for one session."""
+    """The server's choices for one session; a codec of None means: do not send this stream."""
 
     session_id: int
     camera_id: int
     color_codec: int | None
     depth_codec: int | None
     datagram_size: int
+
+
+@dataclass(frozen=True, slots=True)
+class Reject:
+    """Why a hello was refused, and the versions [lowest, highest] that the server speaks."""
+
+    reason: RejectReason
+    lowest_version: int
+    highest_version: int
+    text: str
+
+
+@dataclass(frozen=True, slots=True)
+class Goodbye:
+    """The sender ends the session; `text` says why."""
+
+    text: str
+
+
+@dataclass(frozen=True, slots=True)
+class Heartbeat:
+    """The agent is alive; `health` are its own gauges by name, for the operator."""
+
+    health: Mapping[str, float]
+
+
+@dataclass(frozen=True, slots=True)
+class ClockRequest:
+    """`t1_ns`: rig time at sending."""
+
+    t1_ns: int
+
+
+@dataclass(frozen=True, slots=True)
+class ClockReply:
+    """`t1_ns` echoed; `t2_ns` and `t3_ns`: agent time at receiving the request and sending this."""
+
+    t1_ns: int
+    t2_ns: int
+    t3_ns: int
+
+
+@dataclass(frozen=True, slots=True)
+class UnknownSession:
+    """The server does not know the session that the prefix names."""
+
+
+Message = Hello | Welcome | Reject | Goodbye | Heartbeat | ClockRequest | ClockReply | UnknownSession

@@ -1,0 +1,78 @@
+"""What happened to frames and datagrams, by name (protocol/SPEC.md, sections 7 and 9)."""
+
+from dataclasses import dataclass, fields
+
+
+@dataclass(slots=True)
+class CameraCounters:
+    """Of one camera at the server, over all its sessions. Only ever counted up.
+
+    Frames first: `frames` were delivered, of them `damaged` flagged so; the others were lost. Then fragments
+    and control messages that were dropped.
+    """
+
+    sessions: int = 0
+    bytes: int = 0
+    fragments: int = 0
+    frames: int = 0
+    damaged: int = 0
+    # frames lost
+    missing: int = 0
+    incomplete: int = 0
+    evicted: int = 0
+    corrupt: int = 0
+    unexpected_codec: int = 0
+    untimed: int = 0
+    overflow: int = 0
+    # datagrams dropped
+    late: int = 0
+    duplicate: int = 0
+    oversized: int = 0
+    bad_fragment: int = 0
+    bad_clock_reply: int = 0
+    clock_steps: int = 0
+
+    @property
+    def lost(self) -> int:
+        """Frames that the agent sent and nobody got."""
+        return (
+            self.missing
+            + self.incomplete
+            + self.evicted
+            + self.corrupt
+            + self.unexpected_codec
+            + self.untimed
+            + self.overflow
+        )
+
+    def as_dict(self) -> dict[str, int]:
+        """Every counter by name."""
+        return {field.name: getattr(self, field.name) for field in fields(self)}
+
+
+@dataclass(slots=True)
+class AgentCounters:
+    """Of one agent's link. Only ever counted up."""
+
+    hellos: int = 0
+    sessions: int = 0
+    rejects: int = 0
+    frames: int = 0
+    fragments: int = 0
+    bytes: int = 0
+    # frames that were not sent for want of a session
+    not_connected: int = 0
+    # datagrams dropped
+    too_short: int = 0
+    bad_magic: int = 0
+    other_version: int = 0
+    unknown_type: int = 0
+    unexpected_type: int = 0
+    corrupt_control: int = 0
+    malformed: int = 0
+    stale_answer: int = 0
+    unknown_session: int = 0
+
+    def as_dict(self) -> dict[str, int]:
+        """Every counter by name."""
+        return {field.name: getattr(self, field.name) for field in fields(self)}

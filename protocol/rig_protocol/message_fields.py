@@ -1,0 +1,83 @@
+"""Checked values out of a message body: what SPEC section 4 promises, or DataError."""
+
+import math
+import struct
+from collections.abc import Callable, Mapping
+from typing import Any, TypeVar
+
+import msgpack
+
+from rig_protocol.errors import DataError
+
+Fields = Mapping[str, Any]
+T = TypeVar("T")
+
+
+def unpack_map(body: bytes) -> Fields:
+    """The one MessagePack map with string keys that fills `body`."""
+    try:
+        values = msgpack.unpackb(body, raw=False, strict_map_key=True)
+    except (ValueError, TypeError, RecursionError) as error:
+        raise DataError(f"the body is no MessagePack map: {error!r}") from error
+    if not isinstance(values, dict) or not all(isinstance(key, str) for key in values):
+        raise DataError("the body is no MessagePack map with string keys")
+    return values
+
+
+def unpack_fixed(layout: struct.Struct, body: bytes) -> tuple[Any, ...]:
+    """The fields of a body of exactly the layout's size."""
+    if len(body) != layout.size:
+        raise DataError(f"a body of {len(body)} bytes where {layout.size} are due")
+    return layout.unpack(body)
+
+
+def integer(values: Fields, key: str, lowest: int, highest: int) -> int:
+    """An integer in [lowest, highest]; a boolean is none."""
+    value = values.get(key)
+    if not isinstance(value, int) or isinstance(value, bool) or not lowest <= value <= highest:
+        raise DataError(f"{key} must be an integer from {lowest} to {highest}")
+    return value
+
+
+def number(values: Fields, key: str, lowest: float = -math.inf, highest: float = math.inf) -> float:
+    """A finite number in [lowest, highest]."""
+    value = values.get(key)
+    is_number = isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
+    if is_number and lowest <= value <= highest:  # type: ignore[operator]  # is_number has told its type
+        return float(value)  # type: ignore[arg-type]
+    raise DataError(f"{key} must be a finite number from {lowest} to {highest}")
+
+
+def text(values: Fields, key: str, longest: int, shortest: int = 1) -> str:
+    """Printable text of [shortest, longest] bytes in UTF-8."""
+    value = values.get(key)
+    if (
+        not isinstance(value, str)
+        or not value.isprintable()
+        or not shortest <= len(value.encode()) <= longest
+    ):
+        raise DataError(f"{key} must be printable text of {shortest} to {longest} bytes")
+    return value
+
+
+def optional(read: Callable[..., T], values: Fields, key: str, *limits: int) -> T | None:
+    """What `read` yields, or None where the value is nil; an absent key is an error."""
+    if key in values and values[key] is None:
+        return None
+    return read(values, key, *limits)
+
+
+def codec_ids(values: Fields, key: str, most: int) -> tuple[int, ...]:
+    """At most `most` codec ids from 1 to 255."""
+    ids = values.get(key)
+    if not isinstance(ids, list) or len(ids) > most:
+        raise DataError(f"{key} must be a list of at most {most} codec ids")
+    return tuple(integer({key: item}, key, 1, 255) for item in ids)
+
+
+def gauges(values: Fields, key: str, most: int, longest_name: int) -> dict[str, float]:
+    """At most `most` numbers by name."""
+    items = values.get(key)
+    if not isinstance(items, dict) or len(items) > most:
+        raise DataError(f"{key} must be a map of at most {most} numbers")
+    return {text({key: name}, key, longest_name): number(items, name) for name in items}
