@@ -17,6 +17,7 @@ ENVIRONMENT_PREFIX = "RIG_SERVER_"
 CONFIG_PLACES = (Path("rig.toml"), Path("/etc/kinect-rig/rig.toml"))
 DEFAULT_PORT = 7400
 MAX_CAMERAS = 64  # what one server holds in memory and one roster names; a ring has twelve
+CAMERA_NAME = r"^[A-Za-z0-9][A-Za-z0-9_.-]{0,31}$"  # it names folders and files
 
 
 class RingSettings(Settings):
@@ -41,7 +42,7 @@ class CameraSettings(Settings):
 
     id: int = Field(ge=0, lt=MAX_CAMERAS, examples=[0])
     """Slot in the ring; slot 0 defines the rig's x axis."""
-    name: str | None = Field(None, pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]{0,31}$", examples=["cam00"])
+    name: str | None = Field(None, pattern=CAMERA_NAME, examples=["cam00"])
     """Name in tables, reports and recordings; unset: cam00, cam01, ..."""
     serial: str | None = Field(None, examples=["A00366A10921051A"])
     """Serial number that the Kinect reports."""

@@ -30,6 +30,11 @@ _ANCILLARY_SIZE = 2 * socket.CMSG_SPACE(4)  # the segment size and the drop coun
 _RECEIVES_A_TURN = 64  # before the link's own time-outs get their turn: 4 MB of merged datagrams
 
 
+def rig_time_ns() -> int:
+    """The rig clock: this machine's monotonic clock."""
+    return time.monotonic_ns()
+
+
 class Link(Protocol):
     """What the receiver asks of `rig_protocol.server_link.ServerLink`."""
 
@@ -115,7 +120,7 @@ class Receiver:
                 poller.poll(self._timeout_ms())
                 self._receive_some()
                 self._serve_link()
-            self._link.close(time.monotonic_ns())
+            self._link.close(rig_time_ns())
             self._transmit()
         except Exception as error:  # whatever ends this thread must reach the program
             logger.exception("the receiver stopped")
@@ -123,7 +128,7 @@ class Receiver:
 
     def _timeout_ms(self) -> float | None:
         due_ns = self._link.next_timeout_ns()
-        return None if due_ns is None else max(0.0, (due_ns - time.monotonic_ns()) / 1e6)
+        return None if due_ns is None else max(0.0, (due_ns - rig_time_ns()) / 1e6)
 
     def _receive_some(self) -> None:
         for _ in range(_RECEIVES_A_TURN):
@@ -133,7 +138,7 @@ class Receiver:
                 return
             except ConnectionError:  # an agent's host told us that nobody listens there any more
                 continue
-            now_ns = time.monotonic_ns()
+            now_ns = rig_time_ns()
             segment_size = size
             for level, kind, data in ancillary:
                 if level == socket.IPPROTO_UDP and kind == _UDP_GRO:
@@ -146,7 +151,7 @@ class Receiver:
                 self._deliver_events()
 
     def _serve_link(self) -> None:
-        due_ns, now_ns = self._link.next_timeout_ns(), time.monotonic_ns()
+        due_ns, now_ns = self._link.next_timeout_ns(), rig_time_ns()
         if due_ns is not None and due_ns <= now_ns:
             self._link.handle_timeout(now_ns)
         self._deliver_events()
@@ -157,7 +162,7 @@ class Receiver:
             self._on_event(event)
 
     def _transmit(self) -> None:
-        for datagram, address in self._link.datagrams_to_send(time.monotonic_ns()):
+        for datagram, address in self._link.datagrams_to_send(rig_time_ns()):
             try:
                 self._socket.sendto(datagram, address)
             except OSError as error:  # the route to one agent is no reason to stop for the others

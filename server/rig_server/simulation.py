@@ -6,15 +6,13 @@ import signal
 import subprocess
 import sys
 import tempfile
-from collections.abc import Mapping
 from pathlib import Path
-from types import TracebackType
-from typing import Self
 
 from rig_protocol.errors import RigError
 from rig_protocol.events import Address
 from rig_protocol.poses import Pose
-from rig_protocol.rig_folder import RingDrawing, read_true_poses, write_true_poses
+from rig_protocol.rig_folder import read_true_poses
+from rig_server.config import RigSettings, RingSettings
 
 _libc = ctypes.CDLL(None, use_errno=True)  # loaded here: nothing may be loaded between fork and exec
 _PR_SET_PDEATHSIG = 1
@@ -24,11 +22,25 @@ _STOP_TIMEOUT_S = 5.0
 _LOG_LINES = 15
 _FULL_STEP_DEG = 30.0
 
+# Twelve simulated Kinects and the server share two cores at this rate.
+SIMULATED_FPS = 5.0
+
+
+def simulated_settings(settings: RigSettings, cameras: int) -> RigSettings:
+    """`settings` for a simulated ring on this machine: its cameras, its drawing, a free loopback port."""
+    changes = {
+        "listen": "127.0.0.1:0",
+        "cameras": (),
+        "expected_cameras": cameras,
+        "ring": RingSettings(yaw_step_deg=min(_FULL_STEP_DEG, 360.0 / cameras)),
+    }
+    return RigSettings.model_validate(dict(settings) | changes)
+
 
 class Simulation:
-    """Starts `cameras` agents that stream to `server`; the context manager's end ends all of them.
+    """`cameras` agents that stream to `server`, from `start` to `close`.
 
-    Should this process die in any way, the kernel ends the agents. They die with the thread that
+    Should this process die in any way, the kernel ends the agents. They also die with the thread that
     started them, so start a simulation on a thread that outlives it.
     """
 
@@ -40,26 +52,10 @@ class Simulation:
         self._folder = tempfile.TemporaryDirectory(prefix="rig-simulation-")
         self._agents: dict[int, subprocess.Popen[bytes]] = {}
 
-    @property
-    def ring(self) -> RingDrawing:
-        """The drawing that the simulated ring was built after, with its mounting tolerances."""
-        return RingDrawing(yaw_step_deg=min(_FULL_STEP_DEG, 360.0 / self._cameras))
-
-    def __enter__(self) -> Self:
-        """Start the agents."""
-        try:
-            for camera_id in range(self._cameras):
-                self._agents[camera_id] = self._start(camera_id)
-        except BaseException:
-            self.close()
-            raise
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        """End the agents."""
-        self.close()
+    def start(self) -> None:
+        """Start the agents; RigError when the system refuses."""
+        for camera_id in range(self._cameras):
+            self._agents[camera_id] = self._start_agent(camera_id)
 
     def check(self) -> None:
         """RigError with the end of its log when an agent has died."""
@@ -77,12 +73,6 @@ class Simulation:
             poses |= read_true_poses(self._truth_file(camera_id))
         return poses
 
-    def write_truth(self, path: Path) -> Mapping[int, Pose]:
-        """Write `truth.json` of the whole ring; what was written."""
-        poses = self.true_poses()
-        write_true_poses(path, poses)
-        return poses
-
     def close(self) -> None:
         """End all agents and remove their files; harmless when already closed."""
         for agent in self._agents.values():
@@ -96,13 +86,12 @@ class Simulation:
         self._agents.clear()
         self._folder.cleanup()
 
-    def _start(self, camera_id: int) -> subprocess.Popen[bytes]:
+    def _start_agent(self, camera_id: int) -> subprocess.Popen[bytes]:
         host, port = self._server
         options = {
-            "--config": self._empty_config(),
+            "--config": self._config_file(),
             "--source": "synthetic",
             "--camera": camera_id,
-            "--cameras": self._cameras,
             "--seed": self._seed,
             "--fps": self._fps,
             "--server": f"{host}:{port}",
@@ -117,13 +106,13 @@ class Simulation:
                 stderr=subprocess.STDOUT,
                 env=_environment(),
                 start_new_session=True,  # Ctrl-C is for this program; it ends the agents in order
-                preexec_fn=_become_agent,  # noqa: PLW1509  # only system calls happen in it
+                preexec_fn=_become_agent,  # only system calls happen in it
             )
 
-    def _empty_config(self) -> Path:
-        """Keeps the agents from reading the settings of a real agent on this machine."""
+    def _config_file(self) -> Path:
+        """What has no option, and so no settings of a real agent on this machine are read."""
         path = Path(self._folder.name) / "agent.toml"
-        path.touch()
+        path.write_text(f"[synthetic]\ncameras = {self._cameras}\n")
         return path
 
     def _truth_file(self, camera_id: int) -> Path:

@@ -33,11 +33,13 @@ class EchoLink:
     def receive_batch(self, batch: DatagramBatch, address: Address, now_ns: int) -> None:
         if self.broken:
             raise ZeroDivisionError("a link that fails")
+        self.last_address = address
         self.batches.append([bytes(datagram) for datagram in batch])
         self.outgoing += [(bytes(datagram), address) for datagram in batch]
         self.events.append(CameraLeft(len(batch), str(now_ns)))
 
     def datagrams_to_send(self, now_ns: int) -> list[tuple[bytes, Address]]:
+        self.served_ns = now_ns
         out, self.outgoing = self.outgoing, []
         return out
 
@@ -53,10 +55,9 @@ class EchoLink:
         return self.events.pop(0) if self.events else None
 
     def close(self, now_ns: int) -> None:
+        self.closed_ns = now_ns
         if self.batches:
-            self.outgoing.append((b"goodbye", self._last_address))
-
-    _last_address: Address = ("127.0.0.1", 9)
+            self.outgoing.append((b"goodbye", self.last_address))
 
 
 class Rigged:
@@ -76,7 +77,7 @@ class Rigged:
             seen += event.camera_id
 
 
-@pytest.fixture()
+@pytest.fixture
 def sender() -> Iterator[socket.socket]:
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as udp:
         udp.bind(LOOPBACK)
@@ -156,7 +157,6 @@ def test_the_time_out_of_the_link_fires_without_any_traffic() -> None:
 def test_stopping_says_goodbye_ends_the_thread_and_frees_the_port(sender: socket.socket) -> None:
     link = EchoLink()
     rigged = Rigged(link)
-    link._last_address = sender.getsockname()
     sender.sendto(b"hello", rigged.receiver.address)
     rigged.wait_for_datagrams(1)
     address = rigged.receiver.address
