@@ -1,0 +1,72 @@
+"""Keypoints with descriptors (SIFT, Lowe 2004) of one camera's colour images."""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from rig_calib.overlap import Region
+from rig_protocol.frames import ImageU8
+
+Array = npt.NDArray[np.float64]
+
+_BORDER_PX = 24  # SIFT looks at a neighbourhood; a cropped region brings it along
+_SAME_PLACE_PX = 0.01
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Keypoints:
+    """Keypoints of one image: pixels (N,2), scale in pixels (N,), descriptors (N,128) f32.
+
+    SIFT describes a place once for every dominant orientation; `place` (N,) numbers the distinct places.
+    """
+
+    pixels: Array
+    scale_px: Array
+    descriptors: npt.NDArray[np.float32]
+    place: npt.NDArray[np.intp]
+
+    def __len__(self) -> int:
+        """How many keypoints there are."""
+        return len(self.pixels)
+
+
+def mean_grey(images: Sequence[ImageU8]) -> ImageU8:
+    """One grey image (H,W) of K grey or BGR images of a scene at rest: less noise, same place."""
+    grey = [image if image.ndim == 2 else cv2.cvtColor(image, cv2.COLOR_BGR2GRAY) for image in images]
+    if len(grey) == 1:
+        return np.asarray(grey[0], dtype=np.uint8)
+    return np.rint(np.mean(np.stack(grey), axis=0, dtype=np.float64)).astype(np.uint8)
+
+
+def detect(image: ImageU8, region: Region, max_keypoints: int) -> Keypoints:
+    """The strongest SIFT keypoints of the region of a grey image, in the image's pixels."""
+    top, left = max(region.top - _BORDER_PX, 0), max(region.left - _BORDER_PX, 0)
+    crop = np.ascontiguousarray(image[top : region.bottom + _BORDER_PX, left : region.right + _BORDER_PX])
+    # Without the precise upscale OpenCV's positions are shifted by a quarter of a pixel.
+    sift = cv2.SIFT.create(nfeatures=max_keypoints, enable_precise_upscale=True)
+    found, descriptors = sift.detectAndCompute(crop, None)
+    if not found:
+        return _no_keypoints()
+    pixels = np.array([keypoint.pt for keypoint in found], dtype=np.float64)
+    pixels += (left, top)
+    scale_px = np.array([keypoint.size / 2.0 for keypoint in found])
+    # OpenCV finds keypoints in parallel: their order, not their values, may change from run to run.
+    angles = np.array([keypoint.angle for keypoint in found])
+    order = np.lexsort((angles, scale_px, pixels[:, 1], pixels[:, 0]))
+    order = order[region.contains(pixels[order])]
+    pixels = pixels[order]
+    return Keypoints(pixels, scale_px[order], descriptors[order].astype(np.float32), _places(pixels))
+
+
+def _places(pixels: Array) -> npt.NDArray[np.intp]:
+    moved = (np.abs(np.diff(pixels, axis=0)) > _SAME_PLACE_PX).any(axis=1)
+    return np.concatenate([[0], np.cumsum(moved)]).astype(np.intp)[: len(pixels)]
+
+
+def _no_keypoints() -> Keypoints:
+    return Keypoints(
+        np.empty((0, 2)), np.empty(0), np.empty((0, 128), dtype=np.float32), np.empty(0, dtype=np.intp)
+    )

@@ -1,0 +1,97 @@
+"""Which cameras may share a view, and where in their images, predicted from nominal poses.
+
+Nothing here assumes which image axis is vertical: the poses say it.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from itertools import combinations
+
+import numpy as np
+import numpy.typing as npt
+
+from rig_calib.projection import inside, project, undistort_pixels
+from rig_protocol.camera import Intrinsics
+from rig_protocol.poses import Pose, inverse, transform_points
+
+_GRID_STEP_PX = 16
+_DEPTHS_M = (0.5, 1.0, 2.0, 5.0)  # the sensor's range; in between the overlap changes smoothly
+
+
+@dataclass(frozen=True, slots=True)
+class Region:
+    """A rectangle of an image: columns [left, right) and rows [top, bottom)."""
+
+    left: int
+    top: int
+    right: int
+    bottom: int
+
+    def contains(self, pixels: npt.NDArray[np.float64]) -> npt.NDArray[np.bool_]:
+        """Which pixels (N,2) lie in the region."""
+        low, high = (self.left - 0.5, self.top - 0.5), (self.right - 0.5, self.bottom - 0.5)
+        return np.asarray(((pixels >= low) & (pixels <= high)).all(axis=1))
+
+    def union(self, other: "Region") -> "Region":
+        """The smallest region that holds both."""
+        return Region(
+            min(self.left, other.left),
+            min(self.top, other.top),
+            max(self.right, other.right),
+            max(self.bottom, other.bottom),
+        )
+
+
+def whole_image(intrinsics: Intrinsics) -> Region:
+    """The region that is the image."""
+    return Region(0, 0, intrinsics.width, intrinsics.height)
+
+
+def shared_regions(
+    cameras: Mapping[int, Intrinsics], nominal: Mapping[int, Pose | None], margin_deg: float
+) -> dict[tuple[int, int], tuple[Region, Region]]:
+    """For every pair (i, j), i < j, that may share a view: its region in image i and in image j.
+
+    `nominal` holds T_rig_camera; a camera without one may share any part of any other's view. `margin_deg` is
+    by how much a camera may point away from its drawing.
+    """
+    regions = {}
+    for i, j in combinations(sorted(cameras), 2):
+        T_i, T_j = nominal.get(i), nominal.get(j)
+        if T_i is None or T_j is None:
+            regions[i, j] = (whole_image(cameras[i]), whole_image(cameras[j]))
+            continue
+        seen_i = _seen_region(cameras[i], cameras[j], inverse(T_j) @ T_i, margin_deg)
+        seen_j = _seen_region(cameras[j], cameras[i], inverse(T_i) @ T_j, margin_deg)
+        if seen_i is not None and seen_j is not None:
+            regions[i, j] = (seen_i, seen_j)
+    return regions
+
+
+def _seen_region(of: Intrinsics, by: Intrinsics, T_by_of: Pose, margin_deg: float) -> Region | None:
+    """The part of image `of` that camera `by` sees at any depth of the sensor's range."""
+    margin_px = np.deg2rad(margin_deg) * by.fx
+    pixels = _grid(of)
+    rays = np.column_stack([undistort_pixels(of, pixels), np.ones(len(pixels))])
+    seen = np.zeros(len(pixels), dtype=bool)
+    for depth_m in _DEPTHS_M:
+        points = transform_points(T_by_of, rays * depth_m)
+        ahead = points[:, 2] > 0.1 * depth_m
+        seen[ahead] |= inside(by, project(_undistorted(by), points[ahead]), margin_px)
+    if not seen.any():
+        return None
+    low, high = pixels[seen].min(axis=0), pixels[seen].max(axis=0) + 1
+    return Region(int(low[0]), int(low[1]), int(high[0]), int(high[1]))
+
+
+def _grid(intrinsics: Intrinsics) -> npt.NDArray[np.float64]:
+    columns = np.append(np.arange(0, intrinsics.width - 1, _GRID_STEP_PX), intrinsics.width - 1)
+    rows = np.append(np.arange(0, intrinsics.height - 1, _GRID_STEP_PX), intrinsics.height - 1)
+    return np.stack(np.meshgrid(columns, rows), axis=-1).reshape(-1, 2).astype(np.float64)
+
+
+def _undistorted(intrinsics: Intrinsics) -> Intrinsics:
+    """Without distortion, whose polynomial folds back far outside the image."""
+    return Intrinsics(
+        intrinsics.fx, intrinsics.fy, intrinsics.cx, intrinsics.cy, intrinsics.width, intrinsics.height
+    )

@@ -1,0 +1,180 @@
+"""The relative pose of two cameras from matched keypoints with depth.
+
+A seeded RANSAC over three-point alignments (Kabsch 1976) finds the start and the matches that agree; the
+paper's estimate (eq. 4, 5) minimises the distances between the 3D points.
+"""
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from rig_calib.projection import project
+from rig_protocol.camera import Intrinsics
+from rig_protocol.poses import Pose, hat, inverse, se3_exp, transform_points
+
+Array = npt.NDArray[np.float64]
+Mask = npt.NDArray[np.bool_]
+
+_BATCH = 256  # hypotheses scored at once
+_MAX_BATCHES = 16
+_CONFIDENCE = 0.9999
+_POLISH_ROUNDS = 4
+_MIN_SAMPLE_SIDE_M = 0.1  # closer points turn noise into rotation
+_GAUSS_NEWTON_STEPS = 20
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class Side:
+    """One camera's part of N matches: pixels (N,2), points (N,3) in its colour camera, NaN = no depth."""
+
+    color: Intrinsics
+    pixels: Array
+    points: Array
+
+    @property
+    def known(self) -> Mask:
+        """(N,) where the match has depth in this camera."""
+        return np.asarray(np.isfinite(self.points[:, 2]))
+
+
+@dataclass(frozen=True, slots=True)
+class Tolerance:
+    """When a match agrees with a pose: distance in the image, and in depth.
+
+    Depth is compared in inverse metres, where the sensor's noise is the same at every distance; a unit's own
+    depth scale may be off by a share of it.
+    """
+
+    pixels: float = 6.0
+    inverse_depth: float = 0.012  # eight raw steps of noise and of smooth distortion
+    depth_scale: float = 0.03
+
+
+def agreeing(T_i_j: Pose, i: Side, j: Side, tolerance: Tolerance) -> Mask:
+    """(N,) the matches that a pose explains, by every measurement they have; False without any depth."""
+    return np.asarray(_agreeing_all(T_i_j[None], i, j, tolerance)[0])
+
+
+def ransac(
+    i: Side, j: Side, tolerance: Tolerance, rng: np.random.Generator, min_inliers: int
+) -> tuple[Pose, Mask] | None:
+    """T_i_j and the matches that agree with it, or None when fewer than `min_inliers` do."""
+    both = np.flatnonzero(i.known & j.known)
+    if len(both) < 3:
+        return None
+    best, best_count, tried = np.eye(4), 0, 0
+    for _ in range(_MAX_BATCHES):
+        samples = (
+            both[rng.random((_BATCH, len(both))).argpartition(2, axis=1)[:, :3]]
+            if len(both) > 3
+            else both[None]
+        )
+        tried += len(samples)
+        samples = samples[_plausible(i.points[samples], j.points[samples], tolerance)]
+        if len(samples):
+            poses = align_batch(i.points[samples], j.points[samples])
+            counts = _agreeing_all(poses, i, j, tolerance).sum(axis=1)
+            if counts.max() > best_count:
+                best, best_count = poses[counts.argmax()], int(counts.max())
+        if tried >= _trials_needed(best_count / len(i.pixels)):
+            break
+    return _polish(best, i, j, tolerance, min_inliers)
+
+
+def align(p_i: Array, p_j: Array, weights: Array | None = None) -> Pose:
+    """T_i_j that minimises Σ w ‖p_i − T_i_j p_j‖² over points (N,3) (Kabsch 1976)."""
+    weights = np.ones(len(p_i)) if weights is None else weights
+    share = (weights / weights.sum())[:, None]
+    mean_i, mean_j = (share * p_i).sum(axis=0), (share * p_j).sum(axis=0)
+    return _kabsch(((p_i - mean_i) * share).T @ (p_j - mean_j), mean_i, mean_j)
+
+
+def align_batch(p_i: Array, p_j: Array) -> Array:
+    """T_i_j (B,4,4) of B sets of points (B,N,3)."""
+    mean_i, mean_j = p_i.mean(axis=1), p_j.mean(axis=1)
+    covariance = np.einsum("bni,bnj->bij", p_i - mean_i[:, None], p_j - mean_j[:, None])
+    return _kabsch(covariance, mean_i, mean_j)
+
+
+def minimise_distances(p_i: Array, p_j: Array, start: Pose) -> tuple[Pose, Array]:
+    """The paper's estimate of T_i_j from points (N,3), and its normal matrix (6,6), rotation first.
+
+    Gauss-Newton on eq. 4 with the left perturbation of eq. 5.
+    """
+    T, normal = start, np.zeros((6, 6))
+    for _ in range(_GAUSS_NEWTON_STEPS):
+        moved = transform_points(T, p_j)
+        J = np.concatenate([-hat(moved), np.broadcast_to(np.eye(3), (len(moved), 3, 3))], axis=2)
+        normal = np.einsum("nki,nkj->ij", J, J)
+        step = np.linalg.lstsq(normal, np.einsum("nki,nk->i", J, p_i - moved), rcond=None)[0]
+        T = se3_exp(step) @ T
+        if np.abs(step).max() < 1e-12:
+            break
+    return T, normal
+
+
+def _kabsch(covariance: Array, mean_i: Array, mean_j: Array) -> Array:
+    U, _, Vt = np.linalg.svd(covariance)
+    mirrored = np.sign(np.linalg.det(U) * np.linalg.det(Vt))
+    U = U.copy()
+    U[..., :, 2] *= np.where(mirrored == 0, 1.0, mirrored)[..., None]
+    T = np.zeros((*covariance.shape[:-2], 4, 4))
+    T[..., :3, :3] = U @ Vt
+    T[..., :3, 3] = mean_i - np.einsum("...ij,...j->...i", T[..., :3, :3], mean_j)
+    T[..., 3, 3] = 1.0
+    return T
+
+
+def _plausible(p_i: Array, p_j: Array, tolerance: Tolerance) -> Mask:
+    """Samples (B,3,3) whose triangles have sides of one length in both cameras, and none too short."""
+    sides_i, sides_j = (np.linalg.norm(p - np.roll(p, 1, axis=1), axis=2) for p in (p_i, p_j))
+    depth = np.maximum(p_i[..., 2].max(axis=1), p_j[..., 2].max(axis=1))[:, None]
+    allowed = 2.0 * tolerance.depth_scale * np.maximum(sides_i, sides_j) + tolerance.inverse_depth * depth**2
+    alike = (np.abs(sides_i - sides_j) < allowed + 0.02).all(axis=1)
+    return np.asarray(alike & (np.minimum(sides_i, sides_j) > _MIN_SAMPLE_SIDE_M).all(axis=1))
+
+
+def _agreeing_all(poses: Array, i: Side, j: Side, tolerance: Tolerance) -> Mask:
+    """(B,N) for poses T_i_j (B,4,4)."""
+    inverses = np.stack([inverse(T) for T in poses])
+    good_i, depth_ok_i = _seen_alike(poses, j, i, tolerance)
+    good_j, depth_ok_j = _seen_alike(inverses, i, j, tolerance)
+    return (good_i | ~j.known) & (good_j | ~i.known) & depth_ok_i & depth_ok_j & (i.known | j.known)
+
+
+def _seen_alike(poses: Array, source: Side, target: Side, tolerance: Tolerance) -> tuple[Mask, Mask]:
+    """(B,N): which moved source points fall on the target's pixels; which are as deep as its points."""
+    points = (
+        np.nan_to_num(source.points, nan=1.0) @ poses[:, :3, :3].transpose(0, 2, 1) + poses[:, None, :3, 3]
+    )
+    ahead = points[..., 2] > 0.05
+    flat = np.where(ahead[..., None], points, 1.0).reshape(-1, 3)
+    pixels = project(target.color, flat).reshape(*points.shape[:2], 2)
+    near = ((pixels - target.pixels) ** 2).sum(axis=2) < tolerance.pixels**2
+    with np.errstate(divide="ignore"):  # points behind the camera are refused by `ahead`
+        inverse_here, inverse_there = 1.0 / points[..., 2], 1.0 / target.points[:, 2]
+    allowed = tolerance.inverse_depth + tolerance.depth_scale * inverse_there
+    as_deep = ~(np.abs(inverse_here - inverse_there) > allowed) | ~source.known
+    return np.asarray(near & ahead), np.asarray(as_deep)
+
+
+def _polish(pose: Pose, i: Side, j: Side, tolerance: Tolerance, min_inliers: int) -> tuple[Pose, Mask] | None:
+    both = i.known & j.known
+    inlier = agreeing(pose, i, j, tolerance)
+    for _ in range(_POLISH_ROUNDS):
+        if (inlier & both).sum() < 3:
+            return None
+        use = inlier & both
+        # Depth noise grows with the square of the distance.
+        pose = align(i.points[use], j.points[use], 1.0 / np.maximum(i.points[use, 2], j.points[use, 2]) ** 4)
+        inlier = agreeing(pose, i, j, tolerance)
+    return (pose, inlier) if inlier.sum() >= min_inliers and (inlier & both).sum() >= 3 else None
+
+
+def _trials_needed(share: float) -> float:
+    """How many samples of three until one is clean with the wanted confidence."""
+    clean = share**3
+    if clean <= 1e-9:
+        return np.inf
+    return 1.0 if clean >= 1.0 - 1e-12 else float(np.log(1.0 - _CONFIDENCE) / np.log1p(-clean))

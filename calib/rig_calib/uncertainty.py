@@ -1,0 +1,73 @@
+"""How well the poses are known: covariances from the normal matrix of an adjustment.
+
+States that were held at their prior mean but are not known exactly ("considered", Schmidt 1966) pass their
+uncertainty on to the others.
+"""
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from rig_calib.bundle_adjustment import AdjustedCamera, Adjustment
+from rig_calib.observation_model import POSE
+from rig_protocol.poses import Pose, adjoint, inverse
+
+Array = npt.NDArray[np.float64]
+
+# A direction that the data says nothing about gets this information, so that its variance is a large
+# number and not an error: 10 rad, 10 m.
+_VAGUE_INFORMATION = 1e-2
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PoseCovariance:
+    """Joint covariance of the poses of C cameras: `blocks` (C,6,C,6), T_true = T · Exp(δ), rotation first."""
+
+    blocks: Array
+
+    def of(self, camera: int) -> Array:
+        """Covariance (6,6) of one pose."""
+        return np.ascontiguousarray(self.blocks[camera, :, camera, :])
+
+    def relative(self, i: int, j: int, T_i_j: Pose) -> Array:
+        """Covariance (6,6) of T_i_j, on its right: δ_ij = δ_j − Ad(T_j_i) δ_i."""
+        Ad = adjoint(inverse(T_i_j))
+        ii, ij, jj = self.blocks[i, :, i], self.blocks[i, :, j], self.blocks[j, :, j]
+        return np.asarray(jj - Ad @ ij - ij.T @ Ad.T + Ad @ ii @ Ad.T)
+
+
+def pose_covariance(adjustment: Adjustment, cameras: Sequence[AdjustedCamera]) -> PoseCovariance:
+    """Covariance of all poses; depth bias marginalised, intrinsics considered.
+
+    The frame is that of the adjustment: the fixed camera's, or the drawing's.
+    """
+    count = len(cameras)
+    size = len(adjustment.normal) // count
+    considered = np.zeros((count, size), dtype=bool)
+    considered[:, size - len(cameras[0].intrinsics_sigma) :] = True
+    estimated = ~considered
+    for c, camera in enumerate(cameras):
+        if camera.fixed_pose:
+            estimated[c, POSE] = False
+    a, b = np.flatnonzero(estimated), np.flatnonzero(considered)
+    information = adjustment.normal[np.ix_(a, a)] + _VAGUE_INFORMATION * np.eye(len(a))
+    covariance = _symmetric(np.asarray(np.linalg.inv(information), dtype=np.float64))
+    sensitivity = covariance @ adjustment.normal[np.ix_(a, b)]
+    prior = np.concatenate([camera.intrinsics_sigma for camera in cameras]) ** 2
+    covariance = covariance + (sensitivity * prior) @ sensitivity.T
+    full = np.zeros((count * size, count * size))
+    full[np.ix_(a, a)] = _symmetric(covariance)
+    return PoseCovariance(full.reshape(count, size, count, size)[:, POSE, :, POSE])
+
+
+def weakest_direction(covariance: Array) -> tuple[float, float]:
+    """Largest standard deviation of any rotation axis (degrees) and of any translation axis (metres)."""
+    rotation = np.linalg.eigvalsh(covariance[:3, :3])[-1]
+    translation = np.linalg.eigvalsh(covariance[3:, 3:])[-1]
+    return float(np.rad2deg(np.sqrt(max(rotation, 0.0)))), float(np.sqrt(max(translation, 0.0)))
+
+
+def _symmetric(matrix: Array) -> Array:
+    return np.asarray(0.5 * (matrix + matrix.T))
