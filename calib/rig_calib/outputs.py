@@ -1,0 +1,51 @@
+"""The files of one calibration: calibration.json, report.html, cloud.ply, panorama.png."""
+
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+
+from rig_calib.evidence import EdgeEvidence
+from rig_calib.fusion.fused import FusedRig, fuse_rig
+from rig_calib.fusion.panorama_picture import write_panorama
+from rig_calib.fusion.ply import write_ply
+from rig_calib.report import write_report
+from rig_calib.rig_calibration import RigCalibration
+from rig_calib.view import CameraView
+from rig_protocol.errors import ConfigurationError
+from rig_protocol.poses import Pose
+
+
+def make_output_folder(folder: Path) -> None:
+    """Make the folder before the work begins; ConfigurationError when nothing can be written there."""
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        probe = folder / ".writable"
+        probe.touch()
+        probe.unlink()
+    except OSError as error:
+        raise ConfigurationError(f"cannot write to {folder}: {error.strerror}") from error
+
+
+def write_outputs(
+    folder: Path,
+    calibration: RigCalibration,
+    views: Sequence[CameraView],
+    evidence: Sequence[EdgeEvidence] = (),
+    poses_before: Mapping[int, Pose] | None = None,
+    progress: Callable[[str, float], None] | None = None,
+) -> FusedRig:
+    """Write all four files, also of a calibration that failed its gate; calibration.json comes first.
+
+    `poses_before` are T_rig_camera before loop closure. There is no panorama.png when no camera could be
+    placed.
+    """
+    tell = progress or (lambda _stage, _share: None)
+    calibration.save(folder / "calibration.json")
+    tell("fusion", 0.0)
+    fused = fuse_rig(views, calibration)
+    write_ply(folder / "cloud.ply", fused.cloud)
+    if fused.panorama is not None:
+        write_panorama(folder / "panorama.png", fused.panorama)
+    tell("report", 0.5)
+    write_report(folder / "report.html", calibration, views, evidence, poses_before, fused)
+    tell("report", 1.0)
+    return fused
