@@ -1,0 +1,158 @@
+"""What the report says in words and numbers: verdict, key figures, rows of the tables."""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from rig_calib.evidence import EdgeEvidence
+from rig_calib.fusion.viewpoint import Viewpoint
+from rig_calib.rig_calibration import CalibratedCamera, RigCalibration
+from rig_calib.view import CameraView
+from rig_protocol.poses import Pose, inverse, rotation_angle_deg
+
+Array = npt.NDArray[np.float64]
+
+UNKNOWN = "–"
+
+
+@dataclass(frozen=True, slots=True)
+class Sigma:
+    """Standard deviations of a pose in its least certain direction."""
+
+    deg: float
+    mm: float
+
+
+def worst_sigma(camera: CalibratedCamera) -> Sigma | None:
+    """The camera's; None when it has no covariance or defines the frame."""
+    if camera.covariance is None or not camera.covariance.any():
+        return None
+    variances = [float(np.linalg.eigvalsh(camera.covariance[k : k + 3, k : k + 3])[-1]) for k in (0, 3)]
+    deg, m = np.sqrt(np.maximum(variances, 0.0))
+    return Sigma(float(np.rad2deg(deg)), float(m * 1e3))
+
+
+def verdict(calibration: RigCalibration, expected: int) -> str:
+    """One sentence: did it pass, and how good is it or how much is wrong."""
+    placed = len(calibration.cameras)
+    if calibration.failures:
+        count = len(calibration.failures)
+        problems = "one problem" if count == 1 else f"{count} problems"
+        return f"The calibration did not pass: {problems} to solve, {placed} of {expected} cameras placed."
+    everyone = f"all {placed} cameras" if placed == expected else f"{placed} of {expected} cameras"
+    sigmas = {camera.name: sigma for camera in calibration.cameras if (sigma := worst_sigma(camera))}
+    if not sigmas:
+        return f"The calibration passed: {everyone} are placed."
+    name, sigma = max(sigmas.items(), key=lambda item: item[1].mm)
+    return (
+        f"The calibration passed: {everyone} are placed, and the least certain one, {name}, "
+        f"is known to {sigma.deg:.2f}° and {sigma.mm:.1f} mm (one standard deviation)."
+    )
+
+
+def key_figures(calibration: RigCalibration, expected: int) -> dict[str, str]:
+    """The few numbers that one looks at first, by their label."""
+    used = sum(edge.used for edge in calibration.edges)
+    figures = {
+        "cameras placed": f"{len(calibration.cameras)} of {expected}",
+        "edges used": f"{used} of {len(calibration.edges)}",
+        "panoramic frames": str(calibration.frames_used),
+    }
+    loop = calibration.loop_closure
+    if loop is not None:
+        figures["loop before"] = f"{loop.before_deg:.2f}° / {loop.before_mm:.1f} mm"
+        figures["loop after"] = f"{loop.after_deg:.2f}° / {loop.after_mm:.1f} mm"
+    if "total" in calibration.seconds:
+        figures["calibration time"] = f"{calibration.seconds['total']:.1f} s"
+    return figures
+
+
+def camera_rows(
+    calibration: RigCalibration, views: Sequence[CameraView], viewpoint: Viewpoint | None
+) -> list[dict[str, str]]:
+    """A row for every camera of the capture, those that could not be placed included."""
+    rows = []
+    for view in views:
+        camera = calibration.camera(view.camera_id)
+        row = {"name": view.name, "id": str(view.camera_id), "placed": "yes" if camera else ""}
+        if camera is not None and viewpoint is not None:
+            row |= _pose_cells(camera, viewpoint)
+            drawing = view.T_rig_nominal if calibration.rig_frame == "ring" else None
+            row["off_drawing"] = _difference(camera.T_rig_camera, drawing)
+        rows.append(row)
+    return rows
+
+
+def edge_rows(
+    calibration: RigCalibration, names: Mapping[int, str], evidence: Sequence[EdgeEvidence]
+) -> list[dict[str, str]]:
+    """A row for every edge, the used ones first."""
+    rows = []
+    for edge in sorted(calibration.edges, key=lambda edge: (not edge.used, edge.i, edge.j)):
+        residuals = kept_residuals([item for item in evidence if {item.i, item.j} == {edge.i, edge.j}])
+        rows.append(
+            {
+                "pair": f"{names.get(edge.i, edge.i)} – {names.get(edge.j, edge.j)}",
+                "matches": str(edge.matches),
+                "inliers": str(edge.inliers),
+                "rms_mm": f"{edge.rms_mm:.1f}" if edge.inliers else UNKNOWN,
+                "median_px": f"{np.median(residuals):.2f}" if len(residuals) else UNKNOWN,
+                "used": "yes" if edge.used else "",
+                "reason": edge.reason or "",
+            }
+        )
+    return rows
+
+
+def kept_residuals(evidence: Sequence[EdgeEvidence]) -> Array:
+    """Residuals (N,) of the inliers, px."""
+    return _finite([item.residual_px[item.inlier] for item in evidence])
+
+
+def rejected_residuals(evidence: Sequence[EdgeEvidence]) -> Array:
+    """Residuals (N,) of the rejected matches, px."""
+    return _finite([item.residual_px[~item.inlier] for item in evidence])
+
+
+def flatten(values: Mapping[str, object], prefix: str = "") -> dict[str, str]:
+    """Nested mappings as `outer.inner` keys with printable values."""
+    flat: dict[str, str] = {}
+    for key, value in values.items():
+        if isinstance(value, Mapping):
+            flat |= flatten(value, f"{prefix}{key}.")
+        else:
+            flat[f"{prefix}{key}"] = str(value)
+    return flat
+
+
+def _finite(parts: Sequence[Array]) -> Array:
+    values = np.concatenate([np.empty(0), *parts])
+    return np.asarray(values[np.isfinite(values)])
+
+
+def _pose_cells(camera: CalibratedCamera, viewpoint: Viewpoint) -> dict[str, str]:
+    R = inverse(viewpoint.T_rig_view)[:3, :3] @ camera.T_rig_camera[:3, :3]
+    axis, image_up = R[:, 2], -R[:, 0 if viewpoint.portrait else 1]
+    right = np.array([axis[1], -axis[0], 0.0]) / max(float(np.hypot(axis[0], axis[1])), 1e-9)
+    roll = np.arctan2(image_up @ right, image_up @ np.cross(right, axis))
+    x, y, z = camera.T_rig_camera[:3, 3] * 1e3
+    sigma = worst_sigma(camera)
+    correction = camera.depth_correction
+    return {
+        "position": f"{x:.1f}, {y:.1f}, {z:.1f}",
+        "azimuth": f"{np.rad2deg(np.arctan2(axis[1], axis[0])):.2f}",
+        "elevation": f"{np.rad2deg(np.arcsin(np.clip(axis[2], -1, 1))):.2f}",
+        "roll": f"{np.rad2deg(roll):.2f}",
+        "sigma_deg": f"{sigma.deg:.3f}" if sigma else UNKNOWN,
+        "sigma_mm": f"{sigma.mm:.2f}" if sigma else UNKNOWN,
+        "depth_scale": f"{100 * correction.coefficients[0]:+.2f} %" if correction else UNKNOWN,
+    }
+
+
+def _difference(T: Pose, drawing: Pose | None) -> str:
+    if drawing is None:
+        return UNKNOWN
+    difference = inverse(drawing) @ T
+    return f"{rotation_angle_deg(difference):.2f}° / {np.linalg.norm(difference[:3, 3]) * 1e3:.1f} mm"
