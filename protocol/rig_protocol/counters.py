@@ -1,6 +1,7 @@
 """What happened to frames and datagrams, by name (protocol/SPEC.md, sections 7 and 9)."""
 
-from dataclasses import dataclass, fields
+from collections import Counter
+from dataclasses import dataclass, field
 
 
 @dataclass(slots=True)
@@ -45,10 +46,6 @@ class CameraCounters:
             + self.overflow
         )
 
-    def as_dict(self) -> dict[str, int]:
-        """Every counter by name."""
-        return {field.name: getattr(self, field.name) for field in fields(self)}
-
 
 @dataclass(slots=True)
 class AgentCounters:
@@ -57,22 +54,11 @@ class AgentCounters:
     hellos: int = 0
     sessions: int = 0
     rejects: int = 0
+    # frames handed over, and those dropped: without a session, or encoded for another session's choice
     frames: int = 0
     fragments: int = 0
     bytes: int = 0
-    # frames that were not sent for want of a session
     not_connected: int = 0
-    # datagrams dropped
-    too_short: int = 0
-    bad_magic: int = 0
-    other_version: int = 0
-    unknown_type: int = 0
-    unexpected_type: int = 0
-    corrupt_control: int = 0
-    malformed: int = 0
-    stale_answer: int = 0
-    unknown_session: int = 0
-
-    def as_dict(self) -> dict[str, int]:
-        """Every counter by name."""
-        return {field.name: getattr(self, field.name) for field in fields(self)}
+    unexpected_codec: int = 0
+    # received datagrams that were dropped, by cause
+    rejected: Counter[str] = field(default_factory=Counter)

@@ -66,6 +66,9 @@ class MessageType(IntEnum):
     FRAGMENT = 16
 
 
+FRAGMENT_PREFIX = MAGIC + bytes((VERSION, MessageType.FRAGMENT))
+
+
 class Prefix(NamedTuple):
     """The first 16 bytes of every datagram; `id` is a session id, or a hello's nonce."""
 

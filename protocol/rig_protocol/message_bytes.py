@@ -13,7 +13,6 @@ from rig_protocol.datagram import (
     MAX_DATAGRAM_SIZE,
     MIN_DATAGRAM_SIZE,
     PREFIX_SIZE,
-    VERSION,
     Buffer,
     MessageType,
     Prefix,
@@ -79,6 +78,14 @@ def decode_message(prefix: Prefix, datagram: Buffer) -> Message:
     if len(datagram) > MAX_CONTROL_SIZE:
         raise DataError(f"a control message of {len(datagram)} bytes, at most {MAX_CONTROL_SIZE} are allowed")
     return _READERS[MessageType(prefix.type)](bytes(datagram[PREFIX_SIZE:]))
+
+
+def decode_hello(prefix: Prefix, datagram: Buffer) -> Hello:
+    """The hello of a datagram whose prefix says HELLO; DataError as `decode_message`."""
+    message = decode_message(prefix, datagram)
+    if not isinstance(message, Hello):
+        raise LinkUsageError(f"type {prefix.type} is no hello")
+    return message
 
 
 def control_crc(datagram: Buffer) -> int:
@@ -194,14 +201,7 @@ def _read_reject(body: bytes) -> Reject:
     code, lowest, highest = _REJECT.unpack_from(body)
     known = {reason.value: reason for reason in RejectReason}
     text = printable(body[_REJECT.size :].decode(errors="replace"))
-    return Reject(known.get(code, RejectReason.OTHER), lowest, highest, text)
-
-
-def version_mismatch(theirs: int) -> Reject:
-    """The answer to a hello of another version."""
-    said = f"the agent speaks protocol version {theirs}, this server speaks {VERSION}"
-    mend = "install the same release on both"
-    return Reject(RejectReason.VERSION_MISMATCH, VERSION, VERSION, f"{said}: {mend}")
+    return Reject(known.get(code, RejectReason.OTHER), text, lowest, highest)
 
 
 # ---- the short ones

@@ -5,6 +5,8 @@ from dataclasses import dataclass
 from enum import Enum
 
 from rig_protocol.camera import CameraModel
+from rig_protocol.datagram import VERSION
+from rig_protocol.frames import EncodedFrame
 
 
 class RejectReason(Enum):
@@ -47,15 +49,20 @@ class Welcome:
     depth_codec: int | None
     datagram_size: int
 
+    def allows(self, frame: EncodedFrame) -> bool:
+        """True when every payload of the frame is in the codec chosen for its stream."""
+        streams = ((frame.color, self.color_codec), (frame.depth, self.depth_codec))
+        return all(payload is None or payload.codec_id == chosen for payload, chosen in streams)
+
 
 @dataclass(frozen=True, slots=True)
 class Reject:
     """Why a hello was refused, and the versions [lowest, highest] that the server speaks."""
 
     reason: RejectReason
-    lowest_version: int
-    highest_version: int
     text: str
+    lowest_version: int = VERSION
+    highest_version: int = VERSION
 
 
 @dataclass(frozen=True, slots=True)
