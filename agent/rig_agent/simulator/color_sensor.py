@@ -9,7 +9,7 @@ from rig_protocol.frames import ImageU8
 
 _MEAN_LEVEL = 105.0  # what automatic exposure aims at
 _GAIN_LIMITS = (0.7, 2.5)
-_BLUR_PX = 0.5  # of the lens, one sigma
+_BLUR_PX = 0.7  # of the lens, one sigma
 _VIGNETTING = 0.15  # loss in the corners
 _PHOTON_VARIANCE, _READ_SIGMA = 0.02, 1.0  # variance per level, levels
 

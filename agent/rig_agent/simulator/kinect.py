@@ -48,7 +48,7 @@ class View:
         return _depth(cast(self._scene.surfaces, self.T_room_color, ray_grid(self._unit.color)))
 
     def depth(self, projectors: list[Pose]) -> CleanDepth:
-        """True depth and what keeps a Kinect from measuring it; the neighbours' projectors as T_room_projector."""
+        """True depth and what keeps a Kinect from measuring it; `projectors`: poses of the neighbours'."""
         rays = ray_grid(self._unit.depth)
         hits = cast(self._scene.surfaces, self.T_room_depth, rays)
         z_m = _depth(hits)

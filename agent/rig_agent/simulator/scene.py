@@ -15,6 +15,7 @@ Vector = npt.NDArray[np.float64]
 
 _KEEP_OUT_M = 0.95  # a Kinect measures from 0.5 m on, and people must reach the rig
 _WALL_GAP_M = 0.03  # furniture stands off the wall, so that patterns do not pierce it
+_CORNER_M = 0.55  # half of the widest tall piece: nearer to a corner it would stand beside the overlap
 _PATTERN_TEXEL_M = 0.002
 
 
@@ -111,8 +112,8 @@ def _shell(
     x, y = np.array([length, 0, 0]), np.array([0, width, 0])
     low = -(x + y) / 2
     floor = Surface(low, x, y, str(rng.choice(["planks", "carpet"])))
-    ceiling = Surface(low + (0, 0, height), y, x, "paint", 0.008)
     up = np.array([0, 0, height])
+    ceiling = Surface(low + up, y, x, "paint", 0.008)
     sides = [Surface(wall.origin, wall.length_m * wall.right, up, "paint", 0.006) for wall in walls]
     return [floor, ceiling, *sides]
 
@@ -127,9 +128,12 @@ def _furniture(
     """Tall pieces in front of the blocked overlaps, low ones wherever they fit."""
     taken: list[tuple[Vector, Vector]] = [(rig[:2] - _KEEP_OUT_M, rig[:2] + _KEEP_OUT_M)]
     surfaces: list[Surface] = []
-    for number, target in enumerate(_blocked_targets(rng, settings, walls, targets)):
-        piece = TALL[number % len(TALL)](rng)
-        surfaces += _place(piece, walls, target, taken) or []
+    blocked = 0
+    for target in _overlaps_to_block(rng, walls, targets):
+        if blocked < settings.blocked_overlaps:
+            placed = _place(TALL[blocked % len(TALL)](rng), walls, target, taken)
+            surfaces += placed or []
+            blocked += placed is not None
     for maker in LOW:
         piece = maker(rng)
         for _ in range(30):
@@ -141,26 +145,16 @@ def _furniture(
     return surfaces
 
 
-def _blocked_targets(
-    rng: np.random.Generator,
-    settings: SimulatorSettings,
-    walls: tuple[Wall, ...],
-    targets: list[tuple[int, float]],
+def _overlaps_to_block(
+    rng: np.random.Generator, walls: tuple[Wall, ...], targets: list[tuple[int, float]]
 ) -> list[tuple[int, float]]:
-    """Overlaps to put furniture in front of: clear of corners where possible, and of each other."""
+    """Overlaps in random order; those that meet a wall too near a corner for furniture come last."""
 
     def to_corner(target: tuple[int, float]) -> float:
         return min(target[1], walls[target[0]].length_m - target[1])
 
     order = [targets[i] for i in rng.permutation(len(targets))]
-    order.sort(key=lambda target: to_corner(target) < 0.55)
-    chosen: list[tuple[int, float]] = []
-    for target in order:
-        if len(chosen) < settings.blocked_overlaps and all(
-            target[0] != other[0] or abs(target[1] - other[1]) > 1.4 for other in chosen
-        ):
-            chosen.append(target)
-    return chosen
+    return sorted(order, key=lambda target: to_corner(target) < _CORNER_M)
 
 
 def _place(

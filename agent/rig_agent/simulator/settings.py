@@ -1,12 +1,18 @@
 """What a simulated rig is made of: the reference scene by default, and knobs for robustness studies."""
 
-from pydantic import Field
+from typing import Annotated, Self
+
+from pydantic import Field, model_validator
 
 from rig_protocol.settings import Settings
 
 FULL_CIRCLE_DEG = 360.0
 OVERLAPPING_STEP_DEG = 30.0
 """Neighbours further apart than this share too little of a vertical Kinect's 43 degrees."""
+
+
+RoomSide = Annotated[float, Field(ge=2.8, le=20)]
+RoomHeight = Annotated[float, Field(ge=2.2, le=6)]
 
 
 class Knock(Settings):
@@ -34,7 +40,7 @@ class SimulatorSettings(Settings):
     frames_rendered: int = Field(0, ge=0, le=64)
     """0: every frame has its own noise. K: K frames are made and looped, for load tests."""
 
-    room_m: tuple[float, float, float] = (4.0, 5.0, 2.6)
+    room_m: tuple[RoomSide, RoomSide, RoomHeight] = (4.0, 5.0, 2.6)
     """Length, width and height of the room."""
     ring_radius_m: float = Field(0.22, gt=0, lt=1)
     """Distance of the colour cameras from the rig's axis."""
@@ -73,6 +79,15 @@ class SimulatorSettings(Settings):
     """Id of a camera that delivers colour only."""
     knock: Knock | None = None
     """A camera that is not where the drawing says."""
+
+    @model_validator(mode="after")
+    def _chosen_cameras_exist(self) -> Self:
+        knocked = None if self.knock is None else self.knock.camera
+        chosen = {"depthless_camera": self.depthless_camera, "knock.camera": knocked}
+        for key, camera in chosen.items():
+            if camera is not None and not 0 <= camera < self.cameras:
+                raise ValueError(f"{key} {camera} is not in a ring of {self.cameras} cameras")
+        return self
 
     @property
     def yaw_step_deg(self) -> float:

@@ -15,7 +15,7 @@ Shape = tuple[int, int]
 Painter = Callable[[np.random.Generator, Shape, float], Texture]
 
 # Cells of the pattern's octaves: from a pixel and a half at two metres to half of a panel.
-_PATTERN_CELLS_M = tuple(0.006 * 2**k for k in range(7))
+_PATTERN_CELLS_M = tuple(0.01 * 2**k for k in range(6))
 _PATTERN_BORDER_M = 0.02
 
 
