@@ -12,7 +12,7 @@ from markupsafe import Markup
 
 from rig_calib.evidence import EdgeEvidence
 from rig_calib.figures import charts, pictures, tables
-from rig_calib.figures.dollhouse import BACK_AZIMUTH_DEG, FRONT_AZIMUTH_DEG, dollhouse_picture
+from rig_calib.figures.dollhouse import BACK_AZIMUTH_DEG, FRONT_AZIMUTH_DEG, dollhouse_picture, share_facing
 from rig_calib.figures.plan_view import PlanView, plan_view
 from rig_calib.fusion.agreement import overlap_differences_m
 from rig_calib.fusion.fused import FusedRig
@@ -28,6 +28,7 @@ from rig_protocol.poses import Pose
 _MAX_MATCH_PICTURES = 24  # 60 kB each; more edges than this are in the table only
 _PANORAMA_PX = 2200  # width of the panorama in the page
 _RESIDUAL_LIMIT_PX = 5.0
+_MIN_SHARE_SEEN = 0.25  # of the cloud, for a picture from that side to be worth its place
 _MIN_LOOP_POINTS = 1000  # below, a cut through the room shows nothing
 
 
@@ -151,6 +152,7 @@ def _clouds(case: _Case) -> list[Figure]:
             caption.format(name, len(cloud)),
         )
         for name, azimuth in sides.items()
+        if share_facing(cloud, T_rig_view, azimuth) > _MIN_SHARE_SEEN
     ]
 
 
@@ -184,8 +186,8 @@ def _agreement(case: _Case) -> dict[str, str]:
     for poses in filter(None, (case.poses_before, case.calibration.poses)):
         differences = overlap_differences_m(case.surfaces_at(poses), case.intrinsics(), poses)
         if differences:
-            texts.append(f"{1e3 * np.median(list(differences.values())):.1f} mm")
-    return {"surfaces differ by": " → ".join(texts)} if texts else {}
+            texts.append(f"{1e3 * np.median(list(differences.values())):.1f}")
+    return {"overlaps differ by": " → ".join(texts) + " mm"} if texts else {}
 
 
 def _histogram(evidence: Sequence[EdgeEvidence], title: str, width: int = 460) -> Markup | None:

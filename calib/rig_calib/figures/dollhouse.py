@@ -19,6 +19,12 @@ _DISTANCE_RADII = 3.2
 _FILLED = 0.92  # of the picture's width or height
 
 
+def share_facing(cloud: PointCloud, T_rig_view: Pose, azimuth_deg: float) -> float:
+    """The share (0 to 1) of the cloud that a spectator at this azimuth would see."""
+    points = transform_points(inverse(T_rig_view), cloud.points_m.astype(np.float64))
+    return float(np.mean(points @ _spectator_direction(azimuth_deg) < 0)) if len(points) else 0.0
+
+
 def dollhouse_picture(cloud: PointCloud, T_rig_view: Pose, azimuth_deg: float = BACK_AZIMUTH_DEG) -> ImageU8:
     """The cloud (H,W,3), BGR, in perspective from an azimuth of the view frame.
 

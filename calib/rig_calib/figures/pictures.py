@@ -115,7 +115,7 @@ def _draw_matches(canvas: ImageU8, ends_i: Array, ends_j: Array, inlier: npt.NDA
                 if kept:
                     cv2.circle(canvas, point, 2, color, -1, cv2.LINE_AA)
                 else:
-                    cv2.drawMarker(canvas, point, color, cv2.MARKER_TILTED_CROSS, 6, 1, cv2.LINE_AA)
+                    cv2.drawMarker(canvas, point, color, cv2.MARKER_TILTED_CROSS, 8, 2, cv2.LINE_AA)
 
 
 def _page_shape(limits: Array) -> tuple[int, int]:

@@ -19,7 +19,8 @@ _SIZE_PX, _MARGIN_PX = 620, 40
 _FRUSTUM_RATIO = 0.7  # length of a frustum in units of the rig's radius
 _SIGMAS_95 = 2.448  # 95 % of a 2-D normal distribution
 _MAGNIFICATIONS = (100, 50, 20, 10, 5, 2, 1)
-_ELLIPSE_PX = 30.0  # no ellipse is magnified beyond this radius
+_LABEL_PX = 42.0  # from a camera to its name, away from where it looks and clear of its ellipse
+_ELLIPSE_PX = 26.0  # no ellipse is magnified beyond this radius
 _NICE_LENGTHS_M = (1.0, 0.5, 0.2, 0.1, 0.05, 0.02, 0.01)
 _MAX_UNUSED_EDGES = 12  # where all pairs were candidates, drawing the rejected ones would hide the rest
 
@@ -48,7 +49,7 @@ def plan_view(
             parts.append(ellipse(here, covariances[camera.id] * scale, _SIGMAS_95, "uncertainty"))
         parts.append(f'<circle class="camera" cx="{here[0]:.1f}" cy="{here[1]:.1f}" r="4"/>')
         away = page.direction(camera.T_rig_camera)
-        label = here + 24 * away
+        label = here - _LABEL_PX * away
         parts.append(text(label[0], label[1] + 4, camera.name, "middle"))
     parts.append(_scale_bar(page))
     description = f"Plan of {len(calibration.cameras)} cameras from above with their fields of view"

@@ -136,19 +136,23 @@ def _pose_cells(camera: CalibratedCamera, viewpoint: Viewpoint) -> dict[str, str
     R = inverse(viewpoint.T_rig_view)[:3, :3] @ camera.T_rig_camera[:3, :3]
     axis, image_up = R[:, 2], -R[:, 0 if viewpoint.portrait else 1]
     right = np.array([axis[1], -axis[0], 0.0]) / max(float(np.hypot(axis[0], axis[1])), 1e-9)
-    roll = np.arctan2(image_up @ right, image_up @ np.cross(right, axis))
+    roll = float(np.arctan2(image_up @ right, image_up @ np.cross(right, axis)))
     x, y, z = camera.T_rig_camera[:3, 3] * 1e3
     sigma = worst_sigma(camera)
     correction = camera.depth_correction
     return {
         "position": f"{x:.1f}, {y:.1f}, {z:.1f}",
-        "azimuth": f"{np.rad2deg(np.arctan2(axis[1], axis[0])):.2f}",
-        "elevation": f"{np.rad2deg(np.arcsin(np.clip(axis[2], -1, 1))):.2f}",
-        "roll": f"{np.rad2deg(roll):.2f}",
+        "azimuth": _degrees(np.arctan2(axis[1], axis[0])),
+        "elevation": _degrees(np.arcsin(np.clip(axis[2], -1, 1))),
+        "roll": _degrees(roll),
         "sigma_deg": f"{sigma.deg:.3f}" if sigma else UNKNOWN,
         "sigma_mm": f"{sigma.mm:.2f}" if sigma else UNKNOWN,
         "depth_scale": f"{100 * correction.coefficients[0]:+.2f} %" if correction else UNKNOWN,
     }
+
+
+def _degrees(angle_rad: float) -> str:
+    return f"{np.rad2deg(angle_rad):z.2f}"
 
 
 def _difference(T: Pose, drawing: Pose | None) -> str:

@@ -11,8 +11,9 @@ from rig_protocol.errors import DataError
 from rig_protocol.frames import ImageU8
 
 _BACKGROUND, _INK, _FAINT = (24, 22, 20), (235, 232, 228), (120, 116, 112)  # BGR
-_BORDER_PX, _RULER_PX, _LEGEND_PX = 24, 44, 74
-_FONT, _FONT_SCALE = cv2.FONT_HERSHEY_SIMPLEX, 0.6
+_BORDER_PX, _RULER_PX, _LEGEND_PX = 24, 60, 96
+_FONT, _FONT_SCALE = cv2.FONT_HERSHEY_SIMPLEX, 0.95
+_NAME_GAP_PX = 24
 _MIN_WIDTH_PX = 480  # the legend needs this much
 
 
@@ -29,8 +30,9 @@ def write_panorama(path: Path, panorama: Panorama) -> None:
 def panorama_picture(panorama: Panorama) -> ImageU8:
     """The picture (H,W,3), BGR: colour, cameras, depth, scale."""
     low, high = depth_range_m(panorama.depth_m)
+    color = np.where(panorama.color.any(axis=2, keepdims=True), panorama.color, np.uint8(_BACKGROUND))
     strips = (
-        panorama.color,
+        color,
         _camera_ruler(panorama),
         color_depth(panorama.depth_m, low, high),
         _legend(panorama.cylinder.width, low, high),
@@ -59,28 +61,35 @@ def color_depth(depth_m: npt.NDArray[np.float32], low_m: float, high_m: float) -
 
 
 def _camera_ruler(panorama: Panorama) -> ImageU8:
-    """Names of the cameras under the columns where they look."""
+    """Names of the cameras under the columns where they look; those without room get a tick only."""
     strip = _blank(_RULER_PX, panorama.cylinder.width)
-    for name, azimuth in panorama.camera_azimuths_rad.items():
-        column = round(float(panorama.cylinder.column(np.array(azimuth))))
-        cv2.line(strip, (column, 0), (column, 10), _FAINT, 2)
-        _text_centred(strip, name, column, 32)
+    free_from = 0
+    columns = {
+        name: panorama.cylinder.column(np.array(a)) for name, a in panorama.camera_azimuths_rad.items()
+    }
+    for name, column in sorted(columns.items(), key=lambda item: float(item[1])):
+        cv2.line(strip, (round(float(column)), 0), (round(float(column)), 12), _FAINT, 3)
+        left, right = _text_span(strip, name, round(float(column)))
+        if left >= free_from:
+            cv2.putText(strip, name, (left, 44), _FONT, _FONT_SCALE, _INK, 1, cv2.LINE_AA)
+            free_from = right + _NAME_GAP_PX
     return strip
 
 
 def _legend(width: int, low_m: float, high_m: float) -> ImageU8:
     """The colours of depth with a tick every half metre or metre."""
     strip = _blank(_LEGEND_PX, max(width, _MIN_WIDTH_PX))
-    bar = min(900, strip.shape[1] - 200)
+    bar = min(1200, strip.shape[1] - 200)
     left = (strip.shape[1] - bar) // 2
     ramp = np.linspace(low_m, high_m, bar, dtype=np.float32)
-    strip[16:34, left : left + bar] = color_depth(ramp[None], low_m, high_m)
+    strip[18:42, left : left + bar] = color_depth(ramp[None], low_m, high_m)
     step = 0.5 if high_m - low_m <= 4 else 1.0
     for metres in np.arange(np.ceil(low_m / step) * step, high_m + 1e-6, step):
         column = left + round((metres - low_m) / (high_m - low_m) * (bar - 1))
-        cv2.line(strip, (column, 34), (column, 40), _INK, 1)
-        _text_centred(strip, f"{metres:g}", column, 60)
-    cv2.putText(strip, "m", (left + bar + 20, 60), _FONT, _FONT_SCALE, _INK, 1, cv2.LINE_AA)
+        cv2.line(strip, (column, 42), (column, 50), _INK, 2)
+        origin = (_text_span(strip, f"{metres:g}", column)[0], 80)
+        cv2.putText(strip, f"{metres:g}", origin, _FONT, _FONT_SCALE, _INK, 1, cv2.LINE_AA)
+    cv2.putText(strip, "m", (left + bar + 36, 80), _FONT, _FONT_SCALE, _INK, 1, cv2.LINE_AA)
     return strip
 
 
@@ -88,10 +97,11 @@ def _blank(height: int, width: int) -> ImageU8:
     return np.full((height, width, 3), _BACKGROUND, np.uint8)
 
 
-def _text_centred(image: ImageU8, text: str, column: int, baseline: int) -> None:
+def _text_span(image: ImageU8, text: str, column: int) -> tuple[int, int]:
+    """First and last column of a text centred on a column, moved to lie within the image."""
     width = cv2.getTextSize(text, _FONT, _FONT_SCALE, 1)[0][0]
-    left = min(max(column - width // 2, 0), image.shape[1] - width)
-    cv2.putText(image, text, (left, baseline), _FONT, _FONT_SCALE, _INK, 1, cv2.LINE_AA)
+    left = min(max(column - width // 2, 0), max(image.shape[1] - width, 0))
+    return left, left + width
 
 
 def _widened(strip: ImageU8, width: int) -> ImageU8:
