@@ -58,7 +58,6 @@ def key_figures(calibration: RigCalibration, expected: int) -> dict[str, str]:
     figures = {
         "cameras placed": f"{len(calibration.cameras)} of {expected}",
         "edges used": f"{used} of {len(calibration.edges)}",
-        "panoramic frames": str(calibration.frames_used),
     }
     loop = calibration.loop_closure
     if loop is not None:

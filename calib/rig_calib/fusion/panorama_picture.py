@@ -30,7 +30,9 @@ def write_panorama(path: Path, panorama: Panorama) -> None:
 def panorama_picture(panorama: Panorama) -> ImageU8:
     """The picture (H,W,3), BGR: colour, cameras, depth, scale."""
     low, high = depth_range_m(panorama.depth_m)
-    color = np.where(panorama.color.any(axis=2, keepdims=True), panorama.color, np.uint8(_BACKGROUND))
+    color = np.where(
+        panorama.color.any(axis=2, keepdims=True), panorama.color, np.array(_BACKGROUND, np.uint8)
+    )
     strips = (
         color,
         _camera_ruler(panorama),
