@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, Self
+from typing import Any, Literal, Self
 
 from pydantic import Field, field_validator, model_validator
 
@@ -86,6 +86,8 @@ class RigSettings(Settings):
     """Kernel receive buffer to ask for; the kernel's limit is net.core.rmem_max."""
     decoder_threads: int = Field(2, ge=1, le=64)
     """Threads that decode frames; a pair takes about 3 ms of one core."""
+    log_level: Literal["DEBUG", "INFO", "WARNING", "ERROR"] = "INFO"
+    """What is worth a line in the log."""
     synchroniser: SynchroniserSettings = SynchroniserSettings()
     capture: CaptureSettings = CaptureSettings()
     calibration: CalibrationSettings = CalibrationSettings()

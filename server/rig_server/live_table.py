@@ -49,7 +49,9 @@ class LiveDisplay:
 def status_table(status: RigStatus, title: str) -> RenderableType:
     """One line a camera and a footer; fits 80 columns."""
     hot = any(camera.temperature_c is not None for camera in status.cameras)
-    table = Table(title=title, title_justify="left", box=box.SIMPLE_HEAD, pad_edge=False, padding=(0, 1, 0, 0))
+    table = Table(
+        title=title, title_justify="left", box=box.SIMPLE_HEAD, pad_edge=False, padding=(0, 1, 0, 0)
+    )
     table.add_column("camera", no_wrap=True, max_width=14)
     for heading in ("fps", "lost %", "late", "damaged", "corrupt", "twice", "clock ±µs", *["°C"] * hot):
         table.add_column(heading, justify="right", no_wrap=True)
@@ -93,5 +95,9 @@ def _footer(status: RigStatus) -> list[str]:
     sets = f"{status.sets_per_s:.1f} sets/s{spread}, {status.complete} complete, {status.partial} partial"
     missing = ", ".join(names.get(camera_id, str(camera_id)) for camera_id in status.often_missing)
     dropped = ", ".join(f"{name} {count}" for name, count in status.dropped.items() if count)
-    lines = [sets + (f" (often missing: {missing})" if missing else "")]
-    return lines + ([f"dropped: {dropped}"] if dropped else [])
+    lines = [sets]
+    if missing:
+        lines.append(f"often missing: {missing}")
+    if dropped:
+        lines.append(f"dropped: {dropped}")
+    return lines

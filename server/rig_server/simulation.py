@@ -67,11 +67,8 @@ class Simulation:
                 )
 
     def true_poses(self) -> dict[int, Pose]:
-        """True T_rig_camera by camera id, which the agents wrote when they started."""
-        poses: dict[int, Pose] = {}
-        for camera_id in range(self._cameras):
-            poses |= read_true_poses(self._truth_file(camera_id))
-        return poses
+        """True T_rig_camera by camera id, which the first agent wrote when it started."""
+        return read_true_poses(self._truth_file)
 
     def close(self) -> None:
         """End all agents and remove their files; harmless when already closed."""
@@ -92,11 +89,13 @@ class Simulation:
             "--config": self._config_file(),
             "--source": "synthetic",
             "--camera": camera_id,
+            "--cameras": self._cameras,
             "--seed": self._seed,
             "--fps": self._fps,
             "--server": f"{host}:{port}",
-            "--truth-out": self._truth_file(camera_id),
         }
+        if camera_id == 0:
+            options["--truth-out"] = self._truth_file
         words = [str(word) for option in options.items() for word in option]
         with self._log_file(camera_id).open("wb") as log:
             return subprocess.Popen(  # noqa: S603  # our own program, arguments are ours
@@ -110,13 +109,14 @@ class Simulation:
             )
 
     def _config_file(self) -> Path:
-        """What has no option, and so no settings of a real agent on this machine are read."""
+        """An empty one, so that the settings of a real agent on this machine are not read."""
         path = Path(self._folder.name) / "agent.toml"
-        path.write_text(f"[synthetic]\ncameras = {self._cameras}\n")
+        path.touch()
         return path
 
-    def _truth_file(self, camera_id: int) -> Path:
-        return Path(self._folder.name) / f"truth{camera_id:02d}.json"
+    @property
+    def _truth_file(self) -> Path:
+        return Path(self._folder.name) / "truth.json"
 
     def _log_file(self, camera_id: int) -> Path:
         return Path(self._folder.name) / f"agent{camera_id:02d}.log"

@@ -1,0 +1,130 @@
+"""The command line of `rig-server`."""
+
+from pathlib import Path
+from typing import Annotated, Any
+
+import typer
+from rich.console import Console
+
+from rig_protocol.errors import ConfigurationError
+from rig_protocol.programs import run_program, set_up_logging
+
+_EXAMPLES = """
+**Examples**
+
+`rig-server init` — write ./rig.toml, every option explained, then list your cameras in it
+
+`rig-server` — receive on UDP port 7400 and show the live table until Ctrl-C
+
+`rig-server --calibrate --out calibration` — calibrate the ring that streams to this PC
+
+`rig-server --calibrate --simulate 12 --out demo` — the same with twelve simulated Kinects on this machine
+
+Every option can also stand in rig.toml or in the environment (RIG_SERVER_LISTEN, ...).
+The command line wins over the environment, the environment over the file.
+Exit status: 0 done, 1 it failed (the message says what to do), 2 wrong usage or settings.
+"""
+
+app = typer.Typer(
+    add_completion=False,
+    rich_markup_mode="markdown",
+    context_settings={"help_option_names": ["-h", "--help"]},
+)
+
+
+@app.callback(invoke_without_command=True, epilog=_EXAMPLES)
+def run(
+    context: typer.Context,
+    config: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FILE", help="Settings; else ./rig.toml, else /etc/kinect-rig/rig.toml, if there."
+        ),
+    ] = None,
+    listen: Annotated[
+        str | None, typer.Option(metavar="HOST:PORT", help="Receive here; else 0.0.0.0:7400.")
+    ] = None,
+    calibrate: Annotated[
+        bool, typer.Option("--calibrate", help="Calibrate the ring on the first complete sets, then end.")
+    ] = False,
+    simulate: Annotated[
+        int | None,
+        typer.Option(metavar="N", min=1, max=64, help="Start N simulated agents on this machine."),
+    ] = None,
+    seed: Annotated[
+        int | None, typer.Option(metavar="S", min=0, help="Seed of the simulated room and units.")
+    ] = None,
+    frames: Annotated[
+        int | None,
+        typer.Option(metavar="K", min=1, max=100, help="Panoramic frames to use; else 5."),
+    ] = None,
+    method: Annotated[
+        str | None, typer.Option(metavar="joint|paper", help="How to calibrate; else joint.")
+    ] = None,
+    out: Annotated[
+        Path | None, typer.Option(metavar="DIR", help="Folder for the results; else ./calibration.")
+    ] = None,
+) -> None:
+    """Receive the agents' frames and group them into panoramic frames.
+
+    With `--calibrate`: wait for the cameras, calibrate, write calibration.json, report.html, cloud.ply and
+    panorama.png. Otherwise: show a live table until Ctrl-C.
+    """
+    if context.invoked_subcommand is not None:
+        return
+    _refuse_options_without_effect(
+        calibrate, simulate, {"--frames": frames, "--method": method, "--out": out}, seed, listen
+    )
+    from rig_server.config import load_rig_settings
+
+    changes = {"listen": listen, "capture": {"frames": frames}, "calibration": {"method": method}}
+    settings = load_rig_settings(config, changes)
+    set_up_logging(settings.log_level)
+    from rig_server import program  # takes a second: after everything that can be refused at once
+    from rig_server.rig import Rig
+
+    rig = Rig.live(settings) if simulate is None else Rig.simulated(simulate, seed or 0, settings=settings)
+    if calibrate:
+        program.calibrate(rig, out or Path("calibration"), Console())
+    else:
+        program.receive(rig, Console())
+
+
+@app.command()
+def init(
+    path: Annotated[Path, typer.Option(help="File to write.", metavar="FILE")] = Path("rig.toml"),
+) -> None:
+    """Write a commented rig.toml that changes nothing yet."""
+    from rig_protocol.settings_docs import commented_toml
+    from rig_server.config import RigSettings
+
+    try:
+        with path.open("x") as file:
+            file.write(commented_toml(RigSettings))
+    except FileExistsError:
+        raise ConfigurationError(f"{path} exists: remove it or name another with --path") from None
+    except OSError as error:
+        raise ConfigurationError(f"{path} cannot be written: {error.strerror}") from error
+    Console().print(f"wrote {path}; list the cameras in it, then run rig-server", soft_wrap=True)
+
+
+def _refuse_options_without_effect(
+    calibrate: bool, simulate: int | None, of_calibrate: dict[str, Any], seed: int | None, listen: str | None
+) -> None:
+    """ConfigurationError for an option that would have no effect."""
+    for option, value in of_calibrate.items():
+        if value is not None and not calibrate:
+            raise ConfigurationError(f"{option} needs --calibrate")
+    if seed is not None and simulate is None:
+        raise ConfigurationError("--seed needs --simulate N")
+    if listen is not None and simulate is not None:
+        raise ConfigurationError("--listen has no effect with --simulate, which uses a free loopback port")
+
+
+def main() -> None:
+    """Entry point."""
+    run_program(app)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,194 @@
+"""The live pipeline: socket → link → decoder → synchroniser → panoramic frames."""
+
+import logging
+import secrets
+import threading
+import time
+from collections import deque
+
+from rig_protocol.codecs import COLOR_CODECS, DEPTH_CODECS
+from rig_protocol.errors import RigError
+from rig_protocol.events import (
+    Address,
+    CameraJoined,
+    CameraLeft,
+    FrameReceived,
+    HelloRefused,
+    ServerEvent,
+)
+from rig_protocol.frames import PanoramicFrame
+from rig_protocol.messages import Hello
+from rig_protocol.rig_folder import RigDescription
+from rig_protocol.roster import Roster, Slot
+from rig_protocol.server_link import ServerLink
+from rig_protocol.server_session import CameraStatus
+from rig_server.assembler import Assembler
+from rig_server.attendance import absence_message, is_whole
+from rig_server.config import RigSettings
+from rig_server.decoder import FrameDecoder
+from rig_server.description import camera_names, describe_rig
+from rig_server.metrics import TEMPERATURE, CameraMetrics, RateMeter, RigStatus, summarise_sets
+from rig_server.receiver import Receiver, rig_time_ns
+from rig_server.synchroniser import Synchroniser
+
+logger = logging.getLogger(__name__)
+
+_REFUSALS = 8  # the latest refused hellos, for the message about cameras that do not come
+
+
+class LivePipeline:
+    """Receives from agents between `start` and `stop`; binds its port on construction.
+
+    Three kinds of threads: the receiver, the decoders, and whoever takes the panoramic frames.
+    """
+
+    source = "udp"
+    ended = False
+
+    def __init__(self, settings: RigSettings) -> None:
+        self._settings = settings
+        self._assembler = Assembler(_synchroniser(settings))
+        self._decoder = FrameDecoder(self._assembler.add, threads=settings.decoder_threads)
+        self._link = ServerLink(
+            _roster(settings),
+            session_id_source=lambda: secrets.randbits(64),
+            color_codecs=COLOR_CODECS,
+            depth_codecs=DEPTH_CODECS,
+        )
+        self._receiver = Receiver(self._link, settings.address, self._on_event, settings.receive_buffer_bytes)
+        self._rates = RateMeter()
+        self._presence = threading.Lock()  # guards what follows
+        self._connected: set[int] = set()
+        self._hellos: dict[int, Hello] = {}
+        self._refusals: deque[HelloRefused] = deque(maxlen=_REFUSALS)
+        self._last_join_s = time.monotonic()
+
+    @property
+    def address(self) -> Address:
+        """Where agents send to."""
+        return self._receiver.address
+
+    @property
+    def place(self) -> str:
+        """Where agents send to, in words."""
+        return "UDP {}:{}".format(*self.address)
+
+    @property
+    def hellos(self) -> dict[int, Hello]:
+        """The last hello of every camera that has come so far."""
+        with self._presence:
+            return dict(self._hellos)
+
+    @property
+    def description(self) -> RigDescription:
+        """The cameras that have come so far."""
+        return describe_rig(self._settings, self.hellos)
+
+    def start(self) -> None:
+        """Start receiving."""
+        self._receiver.start()
+
+    def stop(self) -> None:
+        """Say goodbye to the cameras and end all threads; harmless when already stopped."""
+        self._receiver.stop()
+        self._decoder.close()
+
+    def absence(self) -> str | None:
+        """Which expected cameras are not here and what to do; None when all are."""
+        with self._presence:
+            since_s = time.monotonic() - self._last_join_s
+            if is_whole(self._settings, self._connected, since_s):
+                return None
+            return absence_message(self._settings, self._connected, self._refusals)
+
+    def next_panorama(self, timeout_s: float) -> PanoramicFrame | None:
+        """The next set, or None when none came within `timeout_s`; RigError when receiving has failed."""
+        if self._receiver.failure is not None:
+            raise RigError(f"receiving stopped: {self._receiver.failure!r}") from self._receiver.failure
+        return self._assembler.next_panorama(timeout_s)
+
+    def status(self) -> RigStatus:
+        """The rig at this moment."""
+        now_ns = rig_time_ns()
+        cameras = dict(self._link.cameras)
+        rates = self._rates.update({i: camera.counters.frames for i, camera in cameras.items()}, now_ns)
+        names = camera_names(self._settings, self.hellos)
+        sets_per_s, spread_ms, often_missing = summarise_sets(self._assembler.recent, now_ns)
+        return RigStatus(
+            cameras=tuple(
+                self._metrics(camera_id, name, cameras.get(camera_id), rates.get(camera_id, 0.0))
+                for camera_id, name in sorted(names.items())
+            ),
+            complete=self._assembler.complete,
+            partial=self._assembler.partial,
+            sets_per_s=sets_per_s,
+            spread_ms=spread_ms,
+            often_missing=often_missing,
+            dropped=self._dropped(),
+        )
+
+    def _on_event(self, event: ServerEvent) -> None:
+        """On the receiver's thread: nothing here may wait."""
+        match event:
+            case FrameReceived(frame):
+                self._decoder.submit(frame)
+            case CameraJoined(camera_id, hello, address):
+                self._assembler.camera_joined(camera_id, hello.fps)
+                with self._presence:
+                    self._connected.add(camera_id)
+                    self._hellos[camera_id] = hello
+                    self._last_join_s = time.monotonic()
+                logger.info("camera %d (%s) joined from %s", camera_id, hello.name, address[0])
+            case CameraLeft(camera_id, text):
+                self._assembler.camera_left(camera_id)
+                with self._presence:
+                    self._connected.discard(camera_id)
+                logger.warning("camera %d left: %s", camera_id, text)
+            case HelloRefused(address, _, text):
+                with self._presence:
+                    self._refusals.append(event)
+                logger.warning("refused %s: %s", address[0], text)
+
+    def _metrics(self, camera_id: int, name: str, camera: CameraStatus | None, fps: float) -> CameraMetrics:
+        if camera is None:
+            return CameraMetrics(camera_id, name, connected=False)
+        counters, clock = camera.counters, camera.clock
+        return CameraMetrics(
+            camera_id,
+            name,
+            camera.connected,
+            fps=fps,
+            frames=counters.frames,
+            lost=counters.lost,
+            late=self._assembler.late(camera_id),
+            damaged=counters.damaged,
+            duplicate=counters.duplicate,
+            corrupt=counters.corrupt,
+            clock_error_us=None if clock is None else clock.uncertainty_ns / 1e3,
+            temperature_c=camera.health.get(TEMPERATURE),
+        )
+
+    def _dropped(self) -> dict[str, int]:
+        return {
+            "sets not taken": self._assembler.overrun,
+            "frames not decoded": self._decoder.dropped,
+            "frames undecodable": self._decoder.undecodable,
+            "datagrams by the kernel": self._receiver.kernel_drops,
+            "datagrams of no camera": sum(self._link.rejected.values()),
+        }
+
+
+def _synchroniser(settings: RigSettings) -> Synchroniser:
+    options = settings.synchroniser
+    return Synchroniser(
+        (camera.id for camera in settings.cameras),
+        deadline_ns=int(options.deadline_ms * 1e6),
+        max_spread_ns=None if options.max_spread_ms is None else int(options.max_spread_ms * 1e6),
+    )
+
+
+def _roster(settings: RigSettings) -> Roster:
+    slots = tuple(
+        Slot(camera.id, camera.label, camera.serial, camera.port_path) for camera in settings.cameras
+    )
+    return Roster(slots, open=not slots)

@@ -1,0 +1,105 @@
+"""What `rig-server` does: receive and show, or calibrate. Talks to the operator through a rich console."""
+
+import contextlib
+import time
+from collections.abc import Mapping
+from pathlib import Path
+
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
+from rig_calib.evaluation import evaluate
+
+from rig_calib.outputs import make_output_folder, write_outputs
+from rig_calib.rig_calibration import RigCalibration
+from rig_calib.terminal import calibration_tables, evaluation_table
+from rig_protocol.errors import RigError
+from rig_protocol.poses import Pose
+from rig_protocol.rig_folder import write_true_poses
+from rig_server.live_table import LiveDisplay
+from rig_server.rig import Rig
+from rig_server.sinks.calibrate import CalibrateSink, live_provenance, with_serials
+
+_POLL_S = 0.5
+
+
+def receive(rig: Rig, console: Console) -> None:
+    """Show the live table until Ctrl-C or SIGTERM, the ordinary end."""
+    with (
+        contextlib.suppress(KeyboardInterrupt),
+        rig,
+        LiveDisplay(console, f"rig-server, {rig.place}") as display,
+    ):
+        next_update_s = time.monotonic()
+        while True:
+            rig.next_panorama(_POLL_S)
+            if time.monotonic() >= next_update_s:
+                display.update(rig.status())
+                next_update_s = time.monotonic() + _POLL_S
+
+
+def calibrate(rig: Rig, folder: Path, console: Console) -> None:
+    """Wait for the cameras, collect, calibrate, write the files, print the tables.
+
+    RigError when cameras do not come, or when the result fails its gate (the files are written then, too).
+    """
+    make_output_folder(folder)
+    started_s = time.monotonic()
+    with _progress(console) as progress, rig:
+        sink = _collect(rig, progress)
+        truth = rig.true_poses()
+        description, hellos = rig.description, rig.hellos
+        provenance = live_provenance(rig.settings, hellos, rig.source)
+    collected_s = time.monotonic()
+    with _progress(console) as progress:
+        task = progress.add_task("calibrate", total=1.0)
+
+        def tell(stage: str, share: float) -> None:
+            progress.update(task, description=stage, completed=share)
+
+        result, views = sink.calibrate(description, rig.settings, provenance, tell)
+        calibration = with_serials(result.calibration, hellos)
+        calibrated_s = time.monotonic()
+        write_outputs(folder, calibration, views, result.evidence, result.poses_before, tell)
+    console.print(calibration_tables(calibration, views))
+    console.print(
+        f"wrote calibration.json, report.html, cloud.ply, panorama.png to {folder}; capture "
+        f"{collected_s - started_s:.1f} s, calibration {calibrated_s - collected_s:.1f} s, "
+        f"pictures {time.monotonic() - calibrated_s:.1f} s"
+    )
+    if truth is not None:
+        _compare(calibration, truth, folder, console)
+    if calibration.failures:
+        raise RigError("the calibration fails its gate: " + "; ".join(calibration.failures))
+
+
+def _collect(rig: Rig, progress: Progress) -> CalibrateSink:
+    capture = rig.settings.capture
+    waiting = progress.add_task("waiting for cameras", total=rig.settings.expected_cameras)
+    rig.wait_for_cameras(capture.wait_s, lambda status: progress.update(waiting, completed=status.connected))
+    connected = rig.status().connected
+    progress.update(waiting, description="cameras connected", completed=connected, total=connected)
+    sink = CalibrateSink(capture.frames)
+    collecting = progress.add_task("panoramic frames", total=capture.frames)
+    until_s = time.monotonic() + capture.wait_s
+    wanted = True
+    while wanted and time.monotonic() < until_s:
+        panorama = rig.next_panorama(_POLL_S)
+        if panorama is not None:
+            wanted = sink.take(panorama)
+            progress.update(collecting, completed=sink.complete)
+    return sink
+
+
+def _compare(calibration: RigCalibration, truth: Mapping[int, Pose], folder: Path, console: Console) -> None:
+    write_true_poses(folder / "truth.json", truth)
+    console.print(evaluation_table(evaluate(calibration, truth)))
+
+
+def _progress(console: Console) -> Progress:
+    return Progress(
+        TextColumn("{task.description}"),
+        BarColumn(),
+        MofNCompleteColumn(),
+        TimeElapsedColumn(),
+        console=console,
+    )

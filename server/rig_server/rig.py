@@ -1,0 +1,199 @@
+"""Rig: panoramic frames as a Python iterator, live, recorded or simulated alike."""
+
+import re
+import time
+from collections.abc import Callable, Iterator, Mapping
+from pathlib import Path
+from types import TracebackType
+from typing import Protocol, Self
+
+from rig_protocol.errors import ConfigurationError, RigError
+from rig_protocol.frames import PanoramicFrame
+from rig_protocol.messages import Hello
+from rig_protocol.poses import Pose
+from rig_protocol.rig_folder import RigDescription
+from rig_server.config import MAX_CAMERAS, RigSettings, load_rig_settings
+from rig_server.metrics import RigStatus
+from rig_server.pipeline import LivePipeline
+from rig_server.recorded import RecordedRig
+from rig_server.simulation import SIMULATED_FPS, Simulation, simulated_settings
+
+_POLL_S = 0.25  # how soon a dead thread or a dead simulated agent is noticed while nothing comes
+_LIVE_SOURCE = re.compile(r"(udp|simulated):(?://)?(.*)")
+
+
+class Feed(Protocol):
+    """Where the panoramic frames of a rig come from."""
+
+    @property
+    def source(self) -> str:
+        """`udp` or `folder`, for the provenance of a result."""
+        ...
+
+    @property
+    def place(self) -> str:
+        """Where the frames come from, for the operator."""
+        ...
+
+    @property
+    def description(self) -> RigDescription:
+        """The cameras known so far."""
+        ...
+
+    @property
+    def hellos(self) -> Mapping[int, Hello]:
+        """What the agents said of themselves, by camera id; empty where there are none."""
+        ...
+
+    @property
+    def ended(self) -> bool:
+        """True when no panoramic frame will come any more."""
+        ...
+
+    def start(self) -> None:
+        """Begin."""
+        ...
+
+    def stop(self) -> None:
+        """End; harmless when already ended."""
+        ...
+
+    def absence(self) -> str | None:
+        """Which expected cameras are not here and what to do; None when all are."""
+        ...
+
+    def next_panorama(self, timeout_s: float) -> PanoramicFrame | None:
+        """The next set, or None when none came in time; RigError when the feed broke."""
+        ...
+
+    def status(self) -> RigStatus:
+        """The rig at this moment."""
+        ...
+
+
+class Rig:
+    """A ring of cameras. `with Rig.open(...) as rig: for panorama in rig: ...`
+
+    Open it with `Rig.open` or `Rig.simulated`; it runs from `with` to the end of the block.
+    """
+
+    def __init__(self, feed: Feed, settings: RigSettings, simulation: Simulation | None = None) -> None:
+        self.settings = settings
+        self._feed = feed
+        self._simulation = simulation
+
+    @classmethod
+    def open(cls, source: str | Path, settings: RigSettings | None = None) -> Self:
+        """A rig from `udp://HOST:PORT` (listen there), `simulated:N`, or the path of a rig folder.
+
+        Settings: None reads rig.toml as `rig-server` does. ConfigurationError when the source makes no sense.
+        """
+        settings = settings or load_rig_settings(None)
+        match = _LIVE_SOURCE.fullmatch(str(source))
+        if match is None:
+            return cls(RecordedRig(Path(source)), settings)
+        kind, rest = match.groups()
+        if kind == "udp":
+            return cls.live(RigSettings.model_validate(dict(settings) | {"listen": rest}))
+        if not rest.isdecimal() or not 0 < int(rest) <= MAX_CAMERAS:
+            raise ConfigurationError(f"{source!r}: write simulated:N with N cameras, at most {MAX_CAMERAS}")
+        return cls.simulated(int(rest), settings=settings)
+
+    @classmethod
+    def live(cls, settings: RigSettings) -> Self:
+        """The agents that stream to this machine, at the address that the settings state."""
+        return cls(LivePipeline(settings), settings)
+
+    @classmethod
+    def simulated(
+        cls,
+        cameras: int = 12,
+        seed: int = 0,
+        fps: float = SIMULATED_FPS,
+        settings: RigSettings | None = None,
+    ) -> Self:
+        """A ring of simulated agents: processes of this machine that stream over loopback UDP."""
+        settings = simulated_settings(settings or load_rig_settings(None), cameras)
+        pipeline = LivePipeline(settings)
+        return cls(pipeline, settings, Simulation(cameras, seed, fps, pipeline.address))
+
+    def __enter__(self) -> Self:
+        """Begin."""
+        try:
+            if self._simulation is not None:
+                self._simulation.start()
+            self._feed.start()
+        except BaseException:
+            self.close()
+            raise
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        """End."""
+        self.close()
+
+    def __iter__(self) -> Iterator[PanoramicFrame]:
+        """Panoramic frames as they come; without end when live."""
+        while not self._feed.ended:
+            panorama = self.next_panorama(_POLL_S)
+            if panorama is not None:
+                yield panorama
+
+    def close(self) -> None:
+        """End; harmless when already ended."""
+        if self._simulation is not None:
+            self._simulation.close()
+        self._feed.stop()
+
+    def next_panorama(self, timeout_s: float) -> PanoramicFrame | None:
+        """The next set; None when none came within `timeout_s`. RigError when the rig broke."""
+        if self._simulation is not None:
+            self._simulation.check()
+        return self._feed.next_panorama(timeout_s)
+
+    def wait_for_cameras(
+        self, timeout_s: float = 60.0, on_wait: Callable[[RigStatus], None] | None = None
+    ) -> None:
+        """Return when every expected camera is connected; `on_wait` is called a few times a second.
+
+        RigError names those that did not come within `timeout_s`.
+        """
+        until_s = time.monotonic() + timeout_s
+        while (absence := self._feed.absence()) is not None:
+            if self._simulation is not None:
+                self._simulation.check()
+            if time.monotonic() >= until_s:
+                raise RigError(f"after {timeout_s:.0f} s {absence}")
+            if on_wait is not None:
+                on_wait(self.status())
+            time.sleep(_POLL_S)
+
+    @property
+    def description(self) -> RigDescription:
+        """The cameras that have come so far, their models, and nominal poses where the drawing is known."""
+        return self._feed.description
+
+    @property
+    def source(self) -> str:
+        """`udp` or `folder`."""
+        return self._feed.source
+
+    @property
+    def place(self) -> str:
+        """Where the frames come from, in words."""
+        return self._feed.place
+
+    @property
+    def hellos(self) -> Mapping[int, Hello]:
+        """What the agents said of themselves, by camera id; empty for a recording."""
+        return self._feed.hellos
+
+    def status(self) -> RigStatus:
+        """Rates and losses of every camera, and of the sets."""
+        return self._feed.status()
+
+    def true_poses(self) -> Mapping[int, Pose] | None:
+        """True T_rig_camera by camera id; None where nobody knows them."""
+        return None if self._simulation is None else self._simulation.true_poses()

@@ -1,0 +1,104 @@
+"""The calibrating sink: collects panoramic frames, then calibrates on them."""
+
+import dataclasses
+import platform
+from collections.abc import Callable, Mapping
+from datetime import UTC, datetime
+from importlib.metadata import version
+from typing import Any
+
+from rig_calib.calibration import CalibrationResult, calibrate
+
+from rig_calib.rig_calibration import RigCalibration
+from rig_calib.view import CameraView, views_from_panoramas
+from rig_protocol.errors import RigError
+from rig_protocol.frames import PanoramicFrame
+from rig_protocol.messages import Hello
+from rig_protocol.rig_folder import RigDescription
+from rig_server.config import RigSettings
+
+_LIBRARIES = ("kinect-rig", "numpy", "scipy", "opencv-python-headless")
+
+
+class CalibrateSink:
+    """Wants `count` complete sets; keeps the least incomplete partial ones for want of better."""
+
+    def __init__(self, count: int) -> None:
+        self._count = count
+        self._complete: list[PanoramicFrame] = []
+        self._partial: list[PanoramicFrame] = []
+
+    def take(self, panorama: PanoramicFrame) -> bool:
+        """Keep the set; False when there are enough complete ones."""
+        if panorama.complete:
+            self._complete.append(panorama)
+        else:
+            fewest_missing = sorted([*self._partial, panorama], key=lambda one: len(one.missing))
+            self._partial = fewest_missing[: self._count]
+        return len(self._complete) < self._count
+
+    @property
+    def complete(self) -> int:
+        """How many complete sets there are."""
+        return len(self._complete)
+
+    def chosen(self) -> tuple[list[PanoramicFrame], tuple[str, ...]]:
+        """The sets to calibrate on, and a warning where partial ones had to do; RigError for none at all."""
+        if not (self._complete or self._partial):
+            raise RigError(
+                "the cameras are connected but no frame has arrived: look at `journalctl -u rig-agent` on "
+                "their machines"
+            )
+        spare = self._partial[: self._count - len(self._complete)]
+        chosen = sorted([*self._complete, *spare], key=lambda panorama: panorama.index)
+        return chosen, _warnings(len(chosen), spare)
+
+    def calibrate(
+        self,
+        description: RigDescription,
+        settings: RigSettings,
+        provenance: Mapping[str, Any],
+        progress: Callable[[str, float], None],
+    ) -> tuple[CalibrationResult, list[CameraView]]:
+        """Calibrate on the chosen sets; the result carries the provenance and this sink's warnings."""
+        panoramas, warnings = self.chosen()
+        views = views_from_panoramas(description, panoramas)
+        result = calibrate(views, description.ring, settings.calibration, progress)
+        calibration = dataclasses.replace(
+            result.calibration,
+            created=datetime.now(UTC).isoformat(timespec="seconds"),
+            provenance=provenance,
+            warnings=(*warnings, *result.calibration.warnings),
+        )
+        return dataclasses.replace(result, calibration=calibration), views
+
+
+def live_provenance(settings: RigSettings, hellos: Mapping[int, Hello], source: str) -> dict[str, Any]:
+    """What a result remembers of its input: source, agents, versions and the effective settings."""
+    return {
+        "source": source,
+        "agents": len(hellos),
+        "agent_software": sorted({hello.software for hello in hellos.values()}),
+        "versions": {"python": platform.python_version()} | {name: version(name) for name in _LIBRARIES},
+        "settings": settings.model_dump(mode="json"),
+    }
+
+
+def with_serials(calibration: RigCalibration, hellos: Mapping[int, Hello]) -> RigCalibration:
+    """The same calibration with the serial numbers that the agents told."""
+    cameras = tuple(
+        dataclasses.replace(camera, serial=hellos[camera.id].serial) if camera.id in hellos else camera
+        for camera in calibration.cameras
+    )
+    return dataclasses.replace(calibration, cameras=cameras)
+
+
+def _warnings(frames: int, partial: list[PanoramicFrame]) -> tuple[str, ...]:
+    if not partial:
+        return ()
+    missing = sorted({camera_id for panorama in partial for camera_id in panorama.missing})
+    warning = (
+        f"{len(partial)} of {frames} panoramic frames were partial: complete sets did not come in time; "
+        f"missing at times: cameras {', '.join(map(str, missing))}"
+    )
+    return (warning,)
