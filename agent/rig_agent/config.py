@@ -8,8 +8,8 @@ from typing import Any, Literal
 from pydantic import Field, field_validator
 
 from rig_agent.simulator.settings import SimulatorSettings
+from rig_agent.sources.freenect import FreenectSettings
 from rig_protocol.datagram import DEFAULT_DATAGRAM_SIZE, MAX_DATAGRAM_SIZE, MIN_DATAGRAM_SIZE
-from rig_protocol.errors import ConfigurationError
 from rig_protocol.events import Address
 from rig_protocol.settings import Settings, load_settings
 
@@ -63,6 +63,8 @@ class AgentSettings(Settings):
     """What is worth a line in the log."""
     pacing: PacingSettings = PacingSettings()
     """How frames are spread in time."""
+    freenect: FreenectSettings = FreenectSettings()
+    """Options of `source = "freenect"`: which Kinect."""
     folder: FolderSettings = FolderSettings()
     """Options of `source = "folder"`."""
     synthetic: SimulatorSettings = SimulatorSettings()
@@ -89,13 +91,10 @@ class AgentSettings(Settings):
 def load_agent_settings(file: Path | None, overrides: Mapping[str, Any] | None = None) -> AgentSettings:
     """Settings from `file`, else ./agent.toml, else /etc/kinect-rig/agent.toml, else the defaults.
 
-    ConfigurationError names the wrong key, and an option that is missing for the chosen source.
+    ConfigurationError names the wrong key and the nearest known one.
     """
     found = file or next((place for place in CONFIG_PLACES if place.is_file()), None)
-    settings = load_settings(AgentSettings, found, ENVIRONMENT_PREFIX, overrides)
-    if settings.source == "folder" and settings.folder.path is None:
-        raise ConfigurationError("source folder needs a folder: give --path, or `path` in [folder]")
-    return settings
+    return load_settings(AgentSettings, found, ENVIRONMENT_PREFIX, overrides)
 
 
 def _parse_address(text: str) -> Address:

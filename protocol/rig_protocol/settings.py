@@ -87,17 +87,28 @@ def _without_none(values: Mapping[str, Any]) -> dict[str, Any]:
 def _explain(model: type[BaseModel], details: ErrorDetails) -> str:
     where = ".".join(str(part) for part in details["loc"])
     if details["type"] == "extra_forbidden":
-        return f"unknown key `{where}`{_nearest(str(details['loc'][-1]), _field_names(model))}"
+        return f"unknown key `{where}`{_nearest_key(model, details['loc'])}"
     return f"`{where}`: {details['msg']} (got {details['input']!r})"
 
 
-def _field_names(model: type[BaseModel]) -> list[str]:
-    names = list(model.model_fields)
-    for info in model.model_fields.values():
+def _nearest_key(model: type[BaseModel], location: tuple[int | str, ...]) -> str:
+    """The same key of another table, with its path; else a key of the same table that is spelt alike."""
+    *table, key = [str(part) for part in location if isinstance(part, str)]
+    paths = _key_paths(model)
+    for path in paths:
+        if path[-1] == key:
+            return f"; did you mean `{'.'.join(path)}`?"
+    return _nearest(key, [path[-1] for path in paths if list(path[:-1]) == table])
+
+
+def _key_paths(model: type[BaseModel], table: tuple[str, ...] = ()) -> list[tuple[str, ...]]:
+    paths: list[tuple[str, ...]] = []
+    for name, info in model.model_fields.items():
+        paths.append((*table, name))
         for candidate in (info.annotation, *getattr(info.annotation, "__args__", ())):
             if isinstance(candidate, type) and issubclass(candidate, BaseModel):
-                names += _field_names(candidate)
-    return names
+                paths += _key_paths(candidate, (*table, name))
+    return paths
 
 
 def _nearest(name: str, known: list[str]) -> str:

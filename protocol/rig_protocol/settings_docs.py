@@ -97,7 +97,8 @@ def _commented_lines(model: type[BaseModel], defaults: Mapping[str, Any], prefix
         yield from _comment(field.description or "")
         shown = defaults[name]
         if shown is None:
-            yield f"# {_default_text(field, None).capitalize()}; allowed: {_type_text(field)}. For example:"
+            state = "Required" if field.is_required() else "Unset by default"
+            yield f"# {state} ({_type_text(field)}). For example:"
             shown = _example(field)
         # An empty table means its model's defaults, so a default that its parent changed stays active.
         mark = "#" if defaults[name] == own[name] else ""

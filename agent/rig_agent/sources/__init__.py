@@ -1,0 +1,43 @@
+"""The drivers of cameras, by name. A driver and its libraries are imported when it is opened."""
+
+from typing import TYPE_CHECKING
+
+from rig_protocol.errors import ConfigurationError
+
+if TYPE_CHECKING:  # settings know the drivers' options, so they import this package
+    from rig_agent.config import AgentSettings
+    from rig_agent.sources.base import FrameSource
+
+_FOLDER_FPS = 30.0
+
+
+def open_source(settings: "AgentSettings") -> "FrameSource":
+    """Open the source that the settings name; errors are those of the driver."""
+    return _OPENERS[settings.source](settings)
+
+
+def _open_freenect(settings: "AgentSettings") -> "FrameSource":
+    from rig_agent.sources.freenect import FreenectSource
+
+    return FreenectSource(settings.freenect)
+
+
+def _open_folder(settings: "AgentSettings") -> "FrameSource":
+    from rig_agent.sources.folder import FolderSource
+
+    camera = settings.camera if settings.folder.camera is None else settings.folder.camera
+    if settings.folder.path is None:
+        raise ConfigurationError("source folder needs a folder: give --path, or `path` in [folder]")
+    if camera is None:
+        raise ConfigurationError("source folder plays one camera: give --camera, or `camera` in [folder]")
+    return FolderSource(settings.folder.path, camera, settings.fps or _FOLDER_FPS)
+
+
+def _open_synthetic(settings: "AgentSettings") -> "FrameSource":
+    from rig_agent.sources.synthetic import SyntheticSource
+
+    fps = settings.synthetic.fps if settings.fps is None else settings.fps
+    return SyntheticSource(settings.synthetic.model_copy(update={"fps": fps}), settings.camera or 0)
+
+
+_OPENERS = {"freenect": _open_freenect, "folder": _open_folder, "synthetic": _open_synthetic}

@@ -52,6 +52,7 @@ def test_tables_merge_key_by_key(tmp_path: Path, monkeypatch: pytest.MonkeyPatch
     [
         ('sever = "a:1"', r"unknown key `sever`; did you mean `server`"),
         ('[depth]\nkodec = "raw"', r"unknown key `depth.kodec`; did you mean `codec`"),
+        ('codec = "raw"', r"unknown key `codec`; did you mean `depth.codec`"),
         ("fps = 0", r"`fps`: Input should be greater than 0 \(got 0\)"),
         ('fps = "fast"', r"`fps`: .*number.*\(got 'fast'\)"),
         ("fps = ", r"not valid TOML"),

@@ -62,7 +62,7 @@ def test_the_commented_file_explains_every_key() -> None:
     text = commented_toml(Program)
     assert text.startswith("# Settings of a program.\n")
     assert "# Where the server listens:\n# a name or an address.\n#server = " in text
-    assert "# Unset; allowed: text. For example:\n#serial = " in text
+    assert "# Unset by default (text). For example:\n#serial = " in text
 
 
 def test_a_tables_own_default_wins_over_its_models() -> None:
