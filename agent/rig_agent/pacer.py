@@ -27,7 +27,7 @@ class Pacer:
 
     def __init__(self, interval_ns: int, spread: float, burst: int) -> None:
         """`spread` is the share of the frame interval to send over, `burst` the datagrams sent at once."""
-        self._interval_ns = interval_ns
+        self.interval_ns = interval_ns
         self._spread = spread
         self._burst = burst
         self._current: DatagramBatch | None = None
@@ -51,7 +51,7 @@ class Pacer:
         if self._waiting is not None:
             self.counters.dropped += 1
         self._waiting = batch
-        stale = now_ns - self._started_ns > _STALE_INTERVALS * self._interval_ns
+        stale = now_ns - self._started_ns > _STALE_INTERVALS * self.interval_ns
         if self._position == 0 or stale:
             self.counters.dropped += 1
             self._advance(now_ns)
@@ -91,4 +91,4 @@ class Pacer:
         bursts = max(1, -(-len(batch) // self._burst))
         self._current, self._position = batch, 0
         self._started_ns = self._due_ns = now_ns
-        self._step_ns = round(self._interval_ns * self._spread / bursts)
+        self._step_ns = round(self.interval_ns * self._spread / bursts)

@@ -1,0 +1,175 @@
+"""The agent: source → encoder → link → pacer → transport.
+
+Three threads, so that nothing holds up the camera: capture reads frames, the encoder packs them, the
+network loop (the caller's thread) sends them. Between them stand queues that drop the oldest frame.
+"""
+
+import logging
+import os
+import select
+import threading
+from collections.abc import Callable
+from dataclasses import fields, replace
+
+from rig_agent import service
+from rig_agent.capture import Capture
+from rig_agent.config import AgentSettings
+from rig_agent.encoder import encode_frame
+from rig_agent.frame_queue import FrameQueue
+from rig_agent.health import HealthLog, Totals
+from rig_agent.hello import make_hello
+from rig_agent.sources.base import FrameSource, SourceDescription
+from rig_agent.transport import now_ns
+from rig_agent.uplink import Uplink
+from rig_protocol.errors import RigError
+from rig_protocol.frames import EncodedFrame, RgbdFrame
+from rig_protocol.messages import Hello, Welcome
+
+_log = logging.getLogger(__name__)
+
+_QUEUE_FRAMES = 2  # covers one hiccup of the next stage; older frames are stale
+_TICK_S = 0.5  # how soon a thread notices that it should end
+_HUNG_NS = 60_000_000_000  # a driver call that takes longer will not return
+_STOP_TIMEOUT_S = 5.0  # closing a Kinect takes a few seconds at most
+
+
+class Agent:
+    """Streams one camera to one server until it is told to stop, whatever fails in between."""
+
+    def __init__(self, settings: AgentSettings, open_source: Callable[[], FrameSource]) -> None:
+        """Nothing runs before `run`."""
+        self._settings = settings
+        self._captured: FrameQueue[RgbdFrame] = FrameQueue(_QUEUE_FRAMES)
+        self._encoded: FrameQueue[EncodedFrame] = FrameQueue(_QUEUE_FRAMES)
+        self._capture = Capture(
+            open_source, settings.fps, self._source_opened, self._captured.put, self._fail
+        )
+        self._encoder = threading.Thread(target=self._encode_frames, name="encoder", daemon=True)
+        self._uplink = Uplink(settings)
+        self._hello: Hello | None = None  # of the source that is open now
+        self._introduced: Hello | None = None
+        self._welcome: Welcome | None = None  # what the encoder encodes for; None: nobody listens
+        self._unheard = 0
+        self._failure: Exception | None = None
+        self._stopping = threading.Event()
+        self._wake = os.eventfd(0, os.EFD_NONBLOCK | os.EFD_CLOEXEC)
+
+    @property
+    def totals(self) -> Totals:
+        """Counts of all stages since the start."""
+        capture, uplink = self._capture.counters, self._uplink
+        return Totals(
+            captured=capture.captured,
+            sent=uplink.sent,
+            dropped=self._captured.dropped + self._encoded.dropped + uplink.dropped,
+            unheard=self._unheard,
+            damaged=capture.damaged,
+            connections=uplink.connections,
+            source_losses=capture.losses,
+            network_errors=uplink.network_errors,
+        )
+
+    def run(self) -> None:
+        """Run until `stop`, or until something fails that no new attempt cures.
+
+        Either way the server is told goodbye and the source is closed.
+        """
+        self._capture.start()
+        self._encoder.start()
+        try:
+            self._serve_network()
+        finally:
+            self._shut_down()
+        if self._failure is not None:
+            raise self._failure
+
+    def stop(self) -> None:
+        """End `run`, from any thread or signal handler."""
+        self._stopping.set()
+        self._wake_up()
+
+    # ---- network loop: the caller's thread
+
+    def _serve_network(self) -> None:
+        time_ns = now_ns()
+        health = HealthLog(self._settings.report_interval_s, time_ns)
+        watchdog = service.Watchdog()
+        service.notify("READY=1")
+        while not self._stopping.is_set():
+            self._wait(time_ns)
+            time_ns = now_ns()
+            self._forward(time_ns)
+            watchdog.feed(time_ns)
+            if time_ns >= health.due_ns:
+                _log.info("%s", health.line(self.totals, self._welcome is not None, time_ns))
+            if time_ns - self._capture.last_sign_ns > _HUNG_NS:
+                raise RigError(f"the {self._settings.source} driver hangs: start the agent anew")
+
+    def _wait(self, time_ns: int) -> None:
+        """Sleep until a datagram or a frame comes or something is due."""
+        due_ns = self._uplink.next_timeout_ns()
+        timeout_s = _TICK_S if due_ns is None else min(max(due_ns - time_ns, 0) / 1e9, _TICK_S)
+        descriptors = [fd for fd in (self._wake, self._uplink.fileno()) if fd is not None]
+        # select counts in microseconds; epoll would round the pacer's steps up to whole milliseconds.
+        if self._wake in select.select(descriptors, [], [], timeout_s)[0]:
+            os.eventfd_read(self._wake)
+
+    def _forward(self, time_ns: int) -> None:
+        hello = self._hello
+        if hello is not None and hello is not self._introduced:
+            self._introduced = hello
+            self._uplink.introduce(hello, time_ns)
+        # Control first: cutting a frame takes a millisecond, which the clock exchange would feel.
+        self._uplink.serve(time_ns)
+        self._welcome = self._uplink.welcome
+        while (frame := self._encoded.get()) is not None:
+            self._uplink.send_frame(frame, time_ns)
+
+    def _shut_down(self) -> None:
+        self._stopping.set()
+        service.notify("STOPPING=1")
+        self._uplink.close(now_ns())
+        ended = self._capture.stop(_STOP_TIMEOUT_S)
+        if not ended:
+            _log.warning("the %s driver does not return; leaving without it", self._settings.source)
+        self._encoder.join()
+        if ended:
+            os.close(self._wake)
+
+    # ---- what the other threads do and say
+
+    def _encode_frames(self) -> None:
+        try:
+            while not self._stopping.is_set():
+                frame, welcome = self._captured.get(_TICK_S), self._welcome
+                if frame is None:
+                    continue
+                if welcome is None:
+                    self._unheard += 1
+                    continue
+                named = replace(frame, camera_id=welcome.camera_id)
+                self._encoded.put(encode_frame(named, welcome.color_codec, welcome.depth_codec))
+                self._wake_up()
+        except Exception as error:  # the thread's boundary: `run` raises it
+            self._fail(error)
+
+    def _source_opened(self, description: SourceDescription) -> None:
+        """A device that came back as it was keeps its session; another one says hello anew."""
+        hello = make_hello(self._settings, description)
+        if self._hello is None or not _same(hello, self._hello):
+            self._hello = hello
+            self._wake_up()
+
+    def _fail(self, error: Exception) -> None:
+        self._failure = error
+        self.stop()
+
+    def _wake_up(self) -> None:
+        os.eventfd_write(self._wake, 1)
+
+
+def _same(one: Hello, other: Hello) -> bool:
+    """True when two hellos say the same; camera models are compared by their numbers."""
+    names = [field.name for field in fields(Hello) if field.name != "model"]
+    said = [[getattr(hello, name) for name in names] for hello in (one, other)]
+    return said[0] == said[1] and one.model.to_dict() == other.model.to_dict()

@@ -1,0 +1,124 @@
+"""The thread that keeps a source open, through every loss of the device, and hands on its frames."""
+
+import logging
+import threading
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+from rig_agent.sources.base import FrameSource, SourceDescription, SourceLost
+from rig_agent.transport import now_ns
+from rig_protocol.frames import RgbdFrame
+
+_log = logging.getLogger(__name__)
+
+_READ_TIMEOUT_S = 0.5
+_FIRST_RETRY_S = 0.5
+_LAST_RETRY_S = 2.0  # a Kinect plugged in again must be back within 5 s
+
+
+@dataclass(slots=True)
+class CaptureCounters:
+    """What the source delivered and how often it was lost."""
+
+    captured: int = 0
+    damaged: int = 0
+    losses: int = 0
+
+
+class Capture:
+    """Runs one source after another: open, read until it is lost, wait, open again.
+
+    `on_open` and `on_frame` are called on the capture thread and must not wait. `on_failure` gets what no
+    new attempt can cure (a torn file, a wrong setting); the thread has then ended.
+    """
+
+    def __init__(
+        self,
+        open_source: Callable[[], FrameSource],
+        max_fps: float | None,
+        on_open: Callable[[SourceDescription], None],
+        on_frame: Callable[[RgbdFrame], None],
+        on_failure: Callable[[Exception], None],
+    ) -> None:
+        """Frames beyond `max_fps` are left out evenly."""
+        self._open_source = open_source
+        self._max_fps = max_fps
+        self._on_open, self._on_frame, self._on_failure = on_open, on_frame, on_failure
+        self._stopping = threading.Event()
+        # A daemon: a driver that hangs must not keep the program from ending.
+        self._thread = threading.Thread(target=self._run, name="capture", daemon=True)
+        self._next_sequence = 0
+        self.last_sign_ns = now_ns()
+        self.counters = CaptureCounters()
+
+    def start(self) -> None:
+        """Start the thread."""
+        self._thread.start()
+
+    def stop(self, timeout_s: float) -> bool:
+        """Close the source; False when the driver did not come back in time."""
+        self._stopping.set()
+        self._thread.join(timeout_s)
+        return not self._thread.is_alive()
+
+    def _run(self) -> None:
+        retry_s, told = _FIRST_RETRY_S, ""
+        while not self._stopping.is_set():
+            captured = self.counters.captured
+            try:
+                self._run_source()
+            except SourceLost as error:
+                self.counters.losses += 1
+                if self.counters.captured > captured:
+                    retry_s, told = _FIRST_RETRY_S, ""
+                if str(error) != told:
+                    _log.warning("%s; trying again until it is back", error)
+                told = str(error)
+                self._stopping.wait(retry_s)
+                retry_s = min(2 * retry_s, _LAST_RETRY_S)
+            except Exception as error:  # the thread's boundary: whatever it is, the owner must hear of it
+                self._on_failure(error)
+                return
+
+    def _run_source(self) -> None:
+        self.last_sign_ns = now_ns()
+        with self._open_source() as source:
+            description = source.describe()
+            self._on_open(description)
+            wanted = _Thinning(description.fps, self._max_fps)
+            offset: int | None = None
+            while not self._stopping.is_set():
+                frame = source.read(_READ_TIMEOUT_S)
+                self.last_sign_ns = now_ns()
+                if frame is None or not wanted.accepts(frame.timestamp_ns):
+                    continue
+                if offset is None:  # a source that was opened again counts on where the last one ended
+                    offset = self._next_sequence - frame.sequence
+                self._deliver(replace(frame, sequence=frame.sequence + offset))
+
+    def _deliver(self, frame: RgbdFrame) -> None:
+        self._next_sequence = frame.sequence + 1
+        self.counters.captured += 1
+        self.counters.damaged += frame.damaged
+        self._on_frame(frame)
+
+
+class _Thinning:
+    """Lets every frame of a source pass that is no faster than wanted, else the nearest to an even rate."""
+
+    def __init__(self, source_fps: float, max_fps: float | None) -> None:
+        self._active = max_fps is not None and max_fps < source_fps
+        self._interval_ns = 1e9 / (max_fps or source_fps)
+        self._half_source_ns = 0.5e9 / source_fps
+        self._due_ns: float | None = None
+
+    def accepts(self, timestamp_ns: int) -> bool:
+        """True for a frame that is due."""
+        if not self._active:
+            return True
+        if self._due_ns is None or timestamp_ns - self._due_ns > self._interval_ns:
+            self._due_ns = timestamp_ns
+        if timestamp_ns < self._due_ns - self._half_source_ns:
+            return False
+        self._due_ns += self._interval_ns
+        return True

@@ -1,0 +1,172 @@
+"""The program `rig-agent`: streams one camera to the rig server."""
+
+import signal
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from rig_protocol.errors import ConfigurationError
+from rig_protocol.programs import run_program, set_up_logging
+
+if TYPE_CHECKING:  # heavy: imported where they are used, so that --help is quick
+    from rig_agent.agent import Agent
+    from rig_agent.config import AgentSettings
+
+_EXAMPLES = """
+**Examples**
+
+`rig-agent --server 10.0.0.1` — a Kinect on this Pi, to a server there
+
+`rig-agent --source folder --path recordings/office --camera 3` — play camera 3 of a rig folder
+
+`rig-agent --source synthetic --camera 0 --seed 7` — one camera of the simulated ring
+
+`rig-agent init` — write ./agent.toml, every option explained, then edit it and run `rig-agent`
+
+Every option can also stand in agent.toml or in the environment (RIG_AGENT_SERVER,
+RIG_AGENT_FOLDER__PATH, ...). The command line wins over the environment, the environment over the file.
+"""
+
+app = typer.Typer(
+    add_completion=False,
+    rich_markup_mode="markdown",
+    context_settings={"help_option_names": ["-h", "--help"]},
+)
+
+
+@app.callback(invoke_without_command=True, epilog=_EXAMPLES)
+def run(
+    context: typer.Context,
+    config: Annotated[
+        Path | None,
+        typer.Option(help="Settings file; else ./agent.toml, else /etc/kinect-rig/agent.toml, if there."),
+    ] = None,
+    source: Annotated[
+        str | None,
+        typer.Option(
+            metavar="NAME", help="freenect (a Kinect), folder (a recording) or synthetic (simulated)."
+        ),
+    ] = None,
+    server: Annotated[
+        str | None, typer.Option(metavar="HOST[:PORT]", help="Where rig-server listens.")
+    ] = None,
+    camera: Annotated[
+        str | None,
+        typer.Option(metavar="ID", help="Slot in the ring; with a folder, an id or name of nominal.json."),
+    ] = None,
+    path: Annotated[Path | None, typer.Option(help="The rig folder to play (source folder).")] = None,
+    fps: Annotated[float | None, typer.Option(help="Frames a second.")] = None,
+    seed: Annotated[int | None, typer.Option(help="Seed of the simulated rig (source synthetic).")] = None,
+    cameras: Annotated[
+        int | None, typer.Option(metavar="N", help="Cameras of the simulated ring (source synthetic).")
+    ] = None,
+    truth_out: Annotated[
+        Path | None,
+        typer.Option(metavar="FILE", help="Write the true poses of the simulated ring (source synthetic)."),
+    ] = None,
+    print_config: Annotated[
+        bool, typer.Option("--print-config", help="Print the effective settings as TOML and exit.")
+    ] = False,
+) -> None:
+    """Stream one camera, colour and depth, to the rig server until stopped.
+
+    The agent keeps running when the server restarts, the network fails or the Kinect is unplugged.
+    """
+    if context.invoked_subcommand is not None:
+        return
+    from rig_agent.config import load_agent_settings
+    from rig_protocol.settings_docs import effective_toml
+
+    slot, name = _slot_or_name(camera)
+    overrides: dict[str, Any] = {
+        "server": server,
+        "source": source,
+        "camera": slot,
+        "fps": fps,
+        "folder": {"path": path, "camera": name},
+        "synthetic": {"seed": seed, "cameras": cameras},
+    }
+    settings = load_agent_settings(config, overrides)
+    _refuse_options_of_another_source(
+        settings.source,
+        {"--path": path, "--camera NAME": name},
+        {"--seed": seed, "--cameras": cameras, "--truth-out": truth_out},
+    )
+    if print_config:
+        typer.echo(effective_toml(settings), nl=False)
+        return
+    set_up_logging(settings.log_level)
+    if truth_out is not None:
+        _write_truth(truth_out, settings)
+    _stream(settings)
+
+
+@app.command()
+def init(
+    path: Annotated[Path, typer.Option(help="Where to write.")] = Path("agent.toml"),
+    force: Annotated[bool, typer.Option("--force", help="Overwrite an existing file.")] = False,
+) -> None:
+    """Write a commented agent.toml: every option with its meaning and default."""
+    from rig_agent.config import AgentSettings
+    from rig_protocol.settings_docs import commented_toml
+
+    try:
+        with path.open("w" if force else "x") as file:
+            file.write(commented_toml(AgentSettings))
+    except FileExistsError as error:
+        raise ConfigurationError(f"{path} exists: --force overwrites it, --path writes elsewhere") from error
+    except OSError as error:
+        raise ConfigurationError(f"{path} cannot be written: {error.strerror}") from error
+    typer.echo(f"Wrote {path}. Edit it, then run: rig-agent --config {path}")
+
+
+def main() -> None:
+    """Entry point of the program."""
+    run_program(app)
+
+
+def _stream(settings: "AgentSettings") -> None:
+    from rig_agent.agent import Agent
+    from rig_agent.sources import open_source
+
+    agent = Agent(settings, lambda: open_source(settings))
+    # The second Ctrl-C falls back to the usual way: an end without ceremony.
+    for number in (signal.SIGTERM, signal.SIGINT):
+        signal.signal(number, lambda *_: _stop_once(agent))
+    agent.run()
+
+
+def _write_truth(path: Path, settings: "AgentSettings") -> None:
+    from rig_agent.simulator.ring import true_poses
+    from rig_protocol.rig_folder import write_true_poses
+
+    try:
+        write_true_poses(path, true_poses(settings.synthetic))
+    except OSError as error:
+        raise ConfigurationError(f"{path} cannot be written: {error.strerror}") from error
+
+
+def _stop_once(agent: "Agent") -> None:
+    for number in (signal.SIGTERM, signal.SIGINT):
+        signal.signal(number, signal.SIG_DFL)
+    agent.stop()
+
+
+def _slot_or_name(camera: str | None) -> tuple[int | None, str | None]:
+    """`--camera` as the slot that it is, or as the name that a rig folder knows."""
+    if camera is not None and camera.isdecimal():
+        return int(camera), None
+    return None, camera
+
+
+def _refuse_options_of_another_source(source: str, folder: dict[str, Any], synthetic: dict[str, Any]) -> None:
+    """ConfigurationError for an option that the chosen source would silently ignore."""
+    for owner, options in (("folder", folder), ("synthetic", synthetic)):
+        for option, value in options.items():
+            if value is not None and source != owner:
+                raise ConfigurationError(f"{option} belongs to --source {owner}, but the source is {source}")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,53 @@
+"""How the agent is doing: totals of every stage, and one line for the log now and then."""
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True, slots=True)
+class Totals:
+    """Counts since the start of the program."""
+
+    captured: int = 0
+    """Frames that the source delivered."""
+    sent: int = 0
+    """Frames whose every datagram was handed to the network."""
+    dropped: int = 0
+    """Frames given up for newer ones, before or after encoding, or while being sent."""
+    unheard: int = 0
+    """Frames captured while no server listened."""
+    damaged: int = 0
+    """Frames that the source delivered with a part missing."""
+    connections: int = 0
+    """Sessions with the server."""
+    source_losses: int = 0
+    """Times that the device was lost or could not be opened."""
+    network_errors: int = 0
+    """Sends that the network refused."""
+
+
+class HealthLog:
+    """Says when a line is due and what it says; rates are those since the line before."""
+
+    def __init__(self, interval_s: float, now_ns: int) -> None:
+        """The first line is due one interval from now."""
+        self._interval_ns = round(interval_s * 1e9)
+        self._since_ns = now_ns
+        self._before = Totals()
+
+    @property
+    def due_ns(self) -> int:
+        """When the next line is due."""
+        return self._since_ns + self._interval_ns
+
+    def line(self, totals: Totals, connected: bool, now_ns: int) -> str:
+        """One line about the time since the last one."""
+        seconds = max(now_ns - self._since_ns, 1) / 1e9
+        captured, sent = totals.captured - self._before.captured, totals.sent - self._before.sent
+        self._since_ns, self._before = now_ns, totals
+        return (
+            f"{'connected' if connected else 'not connected'}: "
+            f"captured {captured / seconds:.1f} fps, sent {sent / seconds:.1f} fps; in total "
+            f"{totals.sent} sent, {totals.dropped} dropped, {totals.unheard} unheard, "
+            f"{totals.damaged} damaged, {totals.connections} connections, "
+            f"{totals.source_losses} device losses, {totals.network_errors} network errors"
+        )

@@ -1,0 +1,52 @@
+"""What the agent says about itself and its camera when it asks to join the rig."""
+
+from importlib.metadata import version
+from typing import Literal
+
+from rig_agent.config import AgentSettings
+from rig_agent.sources.base import SourceDescription
+from rig_protocol.codecs import Codec, ImageKind, codec, codecs_for
+from rig_protocol.codecs.raw import UncompressedCodec
+from rig_protocol.messages import Hello
+
+Manner = Literal["lossless", "jpeg", "raw"]
+
+# The manners that an agent offers, best first. Nothing is sent lossy that the operator wanted lossless.
+_OFFERS: dict[Manner, tuple[Manner, ...]] = {
+    "lossless": ("lossless", "raw"),
+    "jpeg": ("jpeg", "lossless", "raw"),
+    "raw": ("raw", "lossless"),
+}
+
+
+def make_hello(settings: AgentSettings, source: SourceDescription) -> Hello:
+    """The hello of this agent with this source; the operator's slot wins over a recording's."""
+    slot = source.camera_id if settings.camera is None else settings.camera
+    return Hello(
+        name=settings.display_name(slot),
+        camera_id=slot,
+        serial=source.serial,
+        port_path=source.port_path,
+        model=source.model,
+        color_codecs=_offer(source.color_image, settings.color),
+        depth_codecs=_offer(source.depth_image, settings.depth),
+        fps=min(source.fps, settings.fps or source.fps),
+        software=f"kinect-rig {version('kinect-rig')}",
+    )
+
+
+def _offer(image: ImageKind | None, wanted: Manner) -> tuple[int, ...]:
+    """Wire ids for one kind of image, best first; none for a stream that does not exist."""
+    if image is None:
+        return ()
+    # JPEG of a Bayer mosaic would be useless: the encoder demosaics it first.
+    kinds: list[ImageKind] = [image, "bgr"] if image == "bayer" else [image]
+    known = [codec(id_) for kind in kinds for id_ in codecs_for(kind)]
+    fitting = [one for one in known if one.image == image or not one.lossless]
+    return tuple(one.id for manner in _OFFERS[wanted] for one in fitting if _manner(one) == manner)
+
+
+def _manner(one: Codec) -> Manner:
+    if not one.lossless:
+        return "jpeg"
+    return "raw" if isinstance(one, UncompressedCodec) else "lossless"
