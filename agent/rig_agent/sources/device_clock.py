@@ -33,11 +33,13 @@ class DeviceClock:
         self._lags.append((arrival_ns, arrival_ns - device_ns))
         while arrival_ns - self._lags[0][0] > _WINDOW_NS:
             self._lags.popleft()
-        offset_ns = min(lag for _, lag in self._lags)
-        # The least of n evenly spread delays is 1/(n+1) of their range; the oldest may have drifted since.
-        delay_ns = _TRANSFER_NS // (len(self._lags) + 1)
+        lags = sorted(lag for _, lag in self._lags)
+        offset_ns = lags[0]
+        # The least of n evenly spread delays is expected at 1/(n+1) of their range, which is twice the
+        # distance to their median; a busy machine delays more than the transfer does.
+        range_ns = max(_TRANSFER_NS, 2 * (lags[len(lags) // 2] - offset_ns))
         drift_ns = round(_DRIFT * (arrival_ns - self._lags[0][0]))
-        return device_ns + offset_ns, delay_ns + drift_ns
+        return device_ns + offset_ns, range_ns // (len(lags) + 1) + drift_ns
 
     def _unwrap(self, ticks: int, arrival_ns: int) -> int:
         """Ticks since the first wrap, however long nothing arrived."""

@@ -18,7 +18,7 @@ from rig_agent.sources.base import SourceDescription, SourceLost
 from rig_agent.sources.device_clock import DeviceClock
 from rig_agent.sources.factory_model import camera_model
 from rig_agent.sources.frame_pairing import ImagePair
-from rig_agent.sources.freenect_capture import Capture
+from rig_agent.sources.freenect_thread import FreenectThread
 from rig_agent.sources.libfreenect import load_libfreenect
 from rig_agent.usb import enumerate as usb_bus
 from rig_protocol.errors import RigError
@@ -30,8 +30,8 @@ _STOP_LIMIT_S = 2.0  # stopping takes one poll of 0.1 s and a few commands
 
 log = logging.getLogger(__name__)
 
-_hanging: list[Capture] = []
-"""Captures that neither a stop nor a USB reset brought back; each holds its Kinect."""
+_hanging: list[FreenectThread] = []
+"""Threads that neither a stop nor a USB reset brought back; each holds its Kinect."""
 
 
 class FreenectSettings(Settings):
@@ -56,7 +56,7 @@ class FreenectSource:
         ConfigurationError for a missing library or an unclear choice, SourceLost when the Kinect is
         absent, busy, forbidden or silent, RigError when only a new process can help.
         """
-        if any(not capture.stop(0) for capture in _hanging):
+        if any(not thread.stop(0) for thread in _hanging):
             raise RigError("libfreenect hangs in a Kinect that stopped answering: start the agent anew")
         library = load_libfreenect(settings.library)
         self._timeout_s = settings.timeout_s
@@ -64,23 +64,23 @@ class FreenectSource:
         self._clock = DeviceClock()
         self._sequence = 0
         self._damaged = 0
-        self._capture: Capture | None = Capture(library, self._camera.index)
+        self._thread: FreenectThread | None = FreenectThread(library, self._camera.index)
         try:
-            self._model = camera_model(self._capture.wait_until_open(self._timeout_s))
+            self._model = camera_model(self._thread.wait_until_open(self._timeout_s))
             if not usb_bus.is_claimed(self._camera):
                 raise SourceLost(f"libfreenect opened another camera than {self._camera}: the bus changed")
         except RigError:
             self.close()
             raise
-        self._counters = self._capture.counters
+        self._counters = self._thread.counters
         self._last_pair_s = time.monotonic()
         log.info("%s streams; depth model: %s", self._camera, self._model.source)
 
     @property
     def counters(self) -> Mapping[str, int]:
         """`damaged` frames, `unpaired` images, `overrun` frames nobody read, `unreported` wholeness."""
-        if self._capture:
-            self._counters = self._capture.counters
+        if self._thread:
+            self._counters = self._thread.counters
         return {"damaged": self._damaged, **self._counters}
 
     def describe(self) -> SourceDescription:
@@ -99,10 +99,10 @@ class FreenectSource:
 
         SourceLost when the Kinect is gone or has sent no pair of images for the settings' time-out.
         """
-        if self._capture is None:
+        if self._thread is None:
             raise SourceLost(f"{self._camera} is closed")
         try:
-            pair = self._capture.next_pair(timeout_s)
+            pair = self._thread.next_pair(timeout_s)
         except SourceLost as error:
             raise SourceLost(f"{self._camera} is gone (cable or power?): {error}") from error
         now_s = time.monotonic()
@@ -115,15 +115,15 @@ class FreenectSource:
 
     def close(self) -> None:
         """Release the Kinect; takes a few seconds at most, whatever the device does."""
-        if self._capture is None:
+        if self._thread is None:
             return
-        capture, self._capture = self._capture, None
-        self._counters = capture.counters
-        if capture.stop(_STOP_LIMIT_S):
+        thread, self._thread = self._thread, None
+        self._counters = thread.counters
+        if thread.stop(_STOP_LIMIT_S):
             return
         log.warning("%s does not answer: resetting its USB port", self._camera)
-        if not (usb_bus.reset(self._camera) and capture.stop(_STOP_LIMIT_S)):
-            _hanging.append(capture)
+        if not (usb_bus.reset(self._camera) and thread.stop(_STOP_LIMIT_S)):
+            _hanging.append(thread)
 
     def __enter__(self) -> Self:
         """The source itself."""

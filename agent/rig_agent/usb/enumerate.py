@@ -48,11 +48,13 @@ class KinectCamera:
 
 def usb_devices() -> list[UsbDevice]:
     """Every Microsoft device, in libusb's order, freshly listed. ConfigurationError without libusb."""
-    import usb.backend.libusb1
+    import usb.backend.libusb1 as libusb
     import usb.core
 
-    # A new context lists what is plugged in now, in the order in which a new libfreenect context sees it.
-    backend = usb.backend.libusb1.get_backend(find_library=lambda _name: _LIBUSB)
+    # pyusb keeps its first libusb context, whose list is in order of plugging. Only a new context lists
+    # the cameras in the order in which libfreenect's new context counts them.
+    libusb._lib_object = None
+    backend = libusb.get_backend(find_library=lambda _name: _LIBUSB)
     if backend is None:
         raise ConfigurationError(f"{_LIBUSB} cannot be loaded: apt install libusb-1.0-0")
     return list(usb.core.find(find_all=True, idVendor=MICROSOFT, backend=backend))

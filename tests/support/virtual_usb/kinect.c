@@ -157,7 +157,7 @@ static void power_on(struct kinect *kinect, uint64_t identity)
     frame_file_map(&kinect->frames[VIDEO], kinect_path(kinect, "bayer.bin"), stream_frame_bytes(VIDEO));
     frame_file_map(&kinect->frames[DEPTH], kinect_path(kinect, "depth11.bin"), stream_frame_bytes(DEPTH));
     for (int id = 0; id < STREAMS; id++)
-        kinect->streams[id].next_free_slot = 0;
+        kinect->streams[id].pending = 0;
     firmware_start(kinect);
 }
 

@@ -50,6 +50,7 @@ static int wait_for_answer(libusb_device_handle *handle, unsigned timeout_ms)
     struct kinect *kinect = handle->device->kinect;
     int64_t end_ns = now_ns() + (timeout_ms ? timeout_ms * 1000000LL : INT64_MAX / 2);
     bus_lock();
+    kinect->next_refresh_ns = 0; /* a fault just made must hold */
     uint64_t resets = kinect->resets;
     int result = 0;
     while (!result && handle_alive(handle) && kinect->faults.mute) {

@@ -49,6 +49,11 @@ class KinectFrames:
     bayer: npt.NDArray[np.uint8]  # (N,480,640) GRBG
     raw: npt.NDArray[np.uint16]  # (N,480,640) 11-bit disparity
 
+    @functools.cached_property
+    def packed_raw(self) -> bytes:
+        """The depth images as the sensor sends them."""
+        return pack_11bit(self.raw)
+
     def index_of(self, raw: npt.NDArray[np.uint16]) -> int | None:
         """Which frame this depth image is, byte for byte."""
         return next((i for i, expected in enumerate(self.raw) if np.array_equal(expected, raw)), None)
@@ -74,7 +79,7 @@ class VirtualKinect:
         self.write("serial", serial)
         self.write("model", model)
         (folder / "bayer.bin").write_bytes(frames.bayer.tobytes())
-        (folder / "depth11.bin").write_bytes(pack_11bit(frames.raw))
+        (folder / "depth11.bin").write_bytes(frames.packed_raw)
 
     @property
     def port_path(self) -> str:

@@ -54,7 +54,8 @@ struct frame_file {
 struct stream {
     bool on;
     int64_t on_since_slot;
-    int64_t next_free_slot; /* the bus has promised all earlier slots to submitted transfers */
+    int pending;            /* transfers submitted and not yet completed */
+    int64_t next_free_slot; /* the slots of pending transfers end here */
 };
 
 /* What a test may switch on while the device is in use. */

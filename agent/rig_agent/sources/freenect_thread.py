@@ -23,7 +23,7 @@ _POLL_S = 0.1
 log = logging.getLogger(__name__)
 
 
-class Capture:
+class FreenectThread:
     """Opens the `index`-th Kinect on a thread of its own and streams until stopped or lost."""
 
     def __init__(self, library: ctypes.CDLL, index: int) -> None:
@@ -84,8 +84,8 @@ class Capture:
         except RigError as error:
             self._fail(error)
         except Exception as error:  # a thread's last words would otherwise be lost
-            log.exception("the capture thread failed")
-            self._fail(RigError(f"the capture thread failed: {error!r}"))
+            log.exception("the thread of libfreenect failed")
+            self._fail(RigError(f"the thread of libfreenect failed: {error!r}"))
 
     def _stream(self, library: ctypes.CDLL, index: int) -> None:
         device = FreenectDevice(library, index, self._on_image)

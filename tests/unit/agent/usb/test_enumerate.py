@@ -1,0 +1,116 @@
+"""Kinects on the bus, told apart; the bus is a list of fake pyusb devices."""
+
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+import usb.core
+import usb.util
+
+from rig_agent.sources.base import SourceLost
+from rig_agent.usb.enumerate import KinectCamera, choose_camera, kinect_cameras
+from rig_protocol.errors import ConfigurationError
+
+ZEROS = "0000000000000000"
+
+
+def device(
+    product: int, ports: tuple[int, ...], serial: str | Exception | None, revision: int = 0x010B
+) -> Any:
+    return SimpleNamespace(
+        idProduct=product,
+        bcdDevice=revision,
+        bus=1,
+        address=10 + sum(ports),
+        port_numbers=ports,
+        iSerialNumber=0 if serial is None else 3,
+        serial=serial,
+    )
+
+
+@pytest.fixture(autouse=True)
+def fake_strings(monkeypatch: pytest.MonkeyPatch) -> None:
+    def get_string(device: Any, _index: int) -> str:
+        if isinstance(device.serial, Exception):
+            raise device.serial
+        return str(device.serial)
+
+    monkeypatch.setattr(usb.util, "get_string", get_string)
+    monkeypatch.setattr(usb.util, "dispose_resources", lambda _device: None)
+
+
+def kinect_1414(hub: int, serial: str | Exception) -> list[Any]:
+    return [
+        device(0x02AE, (hub, 1), serial),
+        device(0x02B0, (hub, 2), None),
+        device(0x02AD, (hub, 3), serial),
+    ]
+
+
+def kinect_1473(hub: int, serial: str | Exception) -> list[Any]:
+    return [device(0x02AE, (hub, 1), ZEROS, 0x0200), device(0x02AD, (hub, 3), serial, 0x0200)]
+
+
+def kinect_k4w(hub: int, serial: str) -> list[Any]:
+    return [device(0x02BF, (hub, 1), ZEROS, 0x0200), device(0x02BE, (hub, 3), serial, 0x0200)]
+
+
+def identities(*kinects: list[Any]) -> list[tuple[str, str | None, str]]:
+    cameras = kinect_cameras([part for kinect in kinects for part in kinect])
+    assert [camera.index for camera in cameras] == list(range(len(cameras)))
+    return [(camera.model, camera.serial, camera.port_path) for camera in cameras]
+
+
+def test_each_model_has_its_serial_number_and_place() -> None:
+    assert identities(kinect_1414(1, "A1"), kinect_1473(2, "A2"), kinect_k4w(3, "A3")) == [
+        ("1414", "A1", "1-1.1"),
+        ("1473", "A2", "1-2.1"),
+        ("K4W", "A3", "1-3.1"),
+    ]
+
+
+def test_cameras_without_serial_number_take_it_from_the_audio_device_on_their_own_hub() -> None:
+    first, second = kinect_1473(1, "A1"), kinect_1473(2, "A2")
+    mixed = [first[0], second[1], second[0], first[1]]
+    assert [camera.serial for camera in kinect_cameras(mixed)] == ["A1", "A2"]
+
+
+@pytest.mark.parametrize("error", [ValueError("no langid"), usb.core.USBError("Access denied", -3, 13)])
+def test_a_serial_number_that_may_not_be_read_is_unknown(error: Exception) -> None:
+    assert identities(kinect_1414(1, error), kinect_1473(2, error)) == [
+        ("1414", None, "1-1.1"),
+        ("1473", None, "1-2.1"),
+    ]
+
+
+def test_a_camera_without_serial_number_and_audio_device_is_unknown() -> None:
+    assert identities(kinect_1473(1, "A1")[:1]) == [("1473", None, "1-1.1")]
+
+
+def cameras() -> list[KinectCamera]:
+    return kinect_cameras([*kinect_1414(1, "A1"), *kinect_1414(12, "A2")])
+
+
+def test_the_only_kinect_needs_no_choice() -> None:
+    assert choose_camera(cameras()[:1], None, None).serial == "A1"
+
+
+def test_a_port_is_not_another_port_that_begins_alike() -> None:
+    assert choose_camera(cameras(), None, "1-1").serial == "A1"
+
+
+def test_serial_and_port_must_both_fit() -> None:
+    with pytest.raises(SourceLost, match="no Kinect A1 at USB 1-12 is connected"):
+        choose_camera(cameras(), "A1", "1-12")
+
+
+def test_an_empty_bus_speaks_of_cable_and_power() -> None:
+    with pytest.raises(SourceLost, match=r"cable.*power supply"):
+        choose_camera([], "A1", None)
+
+
+def test_two_kinects_and_no_choice_lists_them() -> None:
+    with pytest.raises(
+        ConfigurationError, match=r"A1 \(1414\) at USB 1-1\.1; Kinect A2 \(1414\) at USB 1-12\.1"
+    ):
+        choose_camera(cameras(), None, None)
