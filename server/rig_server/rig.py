@@ -12,7 +12,7 @@ from rig_protocol.frames import PanoramicFrame
 from rig_protocol.messages import Hello
 from rig_protocol.poses import Pose
 from rig_protocol.rig_folder import RigDescription
-from rig_server.config import MAX_CAMERAS, RigSettings, load_rig_settings
+from rig_server.config import MAX_CAMERAS, RigSettings, load_rig_settings, parse_address
 from rig_server.metrics import RigStatus
 from rig_server.pipeline import LivePipeline
 from rig_server.recorded import RecordedRig
@@ -94,7 +94,7 @@ class Rig:
             return cls(RecordedRig(Path(source)), settings)
         kind, rest = match.groups()
         if kind == "udp":
-            return cls.live(RigSettings.model_validate(dict(settings) | {"listen": rest}))
+            return cls.live(_listening_at(rest, settings))
         if not rest.isdecimal() or not 0 < int(rest) <= MAX_CAMERAS:
             raise ConfigurationError(f"{source!r}: write simulated:N with N cameras, at most {MAX_CAMERAS}")
         return cls.simulated(int(rest), settings=settings)
@@ -197,3 +197,11 @@ class Rig:
     def true_poses(self) -> Mapping[int, Pose] | None:
         """True T_rig_camera by camera id; None where nobody knows them."""
         return None if self._simulation is None else self._simulation.true_poses()
+
+
+def _listening_at(address: str, settings: RigSettings) -> RigSettings:
+    try:
+        parse_address(address)
+    except ValueError as error:
+        raise ConfigurationError(str(error)) from error
+    return settings.model_copy(update={"listen": address})

@@ -1,0 +1,133 @@
+"""From what crossed the wire to frames, on threads of their own."""
+
+import logging
+import threading
+from collections import Counter, deque
+from collections.abc import Callable
+
+from rig_protocol.codecs import COLOR_CODECS, DEPTH_CODECS, codec, warm_up
+from rig_protocol.errors import DataError
+from rig_protocol.frames import EncodedFrame, ImageU8, ImageU16, Payload, RgbdFrame
+
+logger = logging.getLogger(__name__)
+
+
+def decode_frame(frame: EncodedFrame) -> RgbdFrame:
+    """Decode both images; DataError when a payload is malformed or in a codec of the other stream."""
+    images: dict[str, ImageU8 | ImageU16] = {}
+    for payload, known in ((frame.color, COLOR_CODECS), (frame.depth, DEPTH_CODECS)):
+        if payload is not None:
+            images |= _decode_payload(payload, known)
+    return RgbdFrame(
+        camera_id=frame.camera_id,
+        sequence=frame.sequence,
+        timestamp_ns=frame.timestamp_ns,
+        uncertainty_ns=frame.uncertainty_ns,
+        depth_frame=frame.depth_frame,
+        damaged=frame.damaged,
+        **images,
+    )
+
+
+def _decode_payload(payload: Payload, known: tuple[int, ...]) -> dict[str, ImageU8 | ImageU16]:
+    """The image under the name of its RgbdFrame field."""
+    if payload.codec_id not in known:
+        raise DataError(f"codec {payload.codec_id} is none of this stream's: {known}")
+    chosen = codec(payload.codec_id)
+    field = "color" if chosen.image in ("bgr", "grey") else chosen.image
+    return {field: chosen.decode(payload.data)}
+
+
+class FrameDecoder:
+    """Decodes on `threads` threads and calls `deliver` there, each camera's frames in order.
+
+    A camera's frames are decoded one after another, different cameras' at the same time: decoding runs
+    without the interpreter's lock. At most `capacity` frames wait; the default is a tenth of a second
+    of twelve cameras at 30 Hz, beyond which the server does not keep up and old frames lose their worth.
+    """
+
+    def __init__(self, deliver: Callable[[RgbdFrame], None], *, threads: int = 2, capacity: int = 36) -> None:
+        """Starts the threads; the first time on a machine it compiles for some seconds."""
+        if threads < 1 or capacity < 1:
+            raise ValueError(f"threads {threads} and capacity {capacity} must be positive")
+        warm_up()
+        self._deliver = deliver
+        self._capacity = capacity
+        self._waiting: deque[EncodedFrame] = deque()
+        self._busy: set[int] = set()
+        self._changed = threading.Condition()
+        self._closed = False
+        self._dropped: Counter[int] = Counter()
+        self._undecodable: Counter[int] = Counter()
+        self._threads = [
+            threading.Thread(target=self._run, name=f"decoder-{i}", daemon=True) for i in range(threads)
+        ]
+        for thread in self._threads:
+            thread.start()
+
+    @property
+    def dropped_by_camera(self) -> Counter[int]:
+        """Frames that gave way to newer ones."""
+        with self._changed:
+            return self._dropped.copy()
+
+    @property
+    def undecodable_by_camera(self) -> Counter[int]:
+        """Frames whose payload was malformed."""
+        with self._changed:
+            return self._undecodable.copy()
+
+    @property
+    def dropped(self) -> int:
+        """Frames of all cameras that gave way to newer ones."""
+        return self.dropped_by_camera.total()
+
+    @property
+    def undecodable(self) -> int:
+        """Frames of all cameras whose payload was malformed."""
+        return self.undecodable_by_camera.total()
+
+    def submit(self, frame: EncodedFrame) -> None:
+        """Queue a frame; never waits. When the queue is full the oldest frame of all is dropped."""
+        with self._changed:
+            if self._closed:
+                return
+            if len(self._waiting) == self._capacity:
+                self._dropped[self._waiting.popleft().camera_id] += 1
+            self._waiting.append(frame)
+            self._changed.notify()
+
+    def close(self) -> None:
+        """Forget the frames that wait, and return when no `deliver` runs any more; safe to repeat."""
+        with self._changed:
+            self._closed = True
+            self._waiting.clear()
+            self._changed.notify_all()
+        for thread in self._threads:
+            if thread is not threading.current_thread():
+                thread.join()
+
+    def _run(self) -> None:
+        while (frame := self._take()) is not None:
+            try:
+                self._deliver(decode_frame(frame))
+            except DataError as error:
+                with self._changed:
+                    self._undecodable[frame.camera_id] += 1
+                logger.debug("camera %d, frame %d: %s", frame.camera_id, frame.sequence, error)
+            finally:
+                with self._changed:
+                    self._busy.discard(frame.camera_id)
+                    self._changed.notify()
+
+    def _take(self) -> EncodedFrame | None:
+        """Wait for the oldest frame of a camera that no thread works on; None when closed."""
+        with self._changed:
+            while not self._closed:
+                for index, frame in enumerate(self._waiting):
+                    if frame.camera_id not in self._busy:
+                        del self._waiting[index]
+                        self._busy.add(frame.camera_id)
+                        return frame
+                self._changed.wait()
+            return None
