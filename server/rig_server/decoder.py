@@ -4,17 +4,18 @@ import logging
 import threading
 from collections import Counter, deque
 from collections.abc import Callable
+from typing import Any
 
 from rig_protocol.codecs import COLOR_CODECS, DEPTH_CODECS, codec, warm_up
 from rig_protocol.errors import DataError
-from rig_protocol.frames import EncodedFrame, ImageU8, ImageU16, Payload, RgbdFrame
+from rig_protocol.frames import EncodedFrame, Payload, RgbdFrame
 
 logger = logging.getLogger(__name__)
 
 
 def decode_frame(frame: EncodedFrame) -> RgbdFrame:
     """Decode both images; DataError when a payload is malformed or in a codec of the other stream."""
-    images: dict[str, ImageU8 | ImageU16] = {}
+    images: dict[str, Any] = {}
     for payload, known in ((frame.color, COLOR_CODECS), (frame.depth, DEPTH_CODECS)):
         if payload is not None:
             images |= _decode_payload(payload, known)
@@ -29,7 +30,7 @@ def decode_frame(frame: EncodedFrame) -> RgbdFrame:
     )
 
 
-def _decode_payload(payload: Payload, known: tuple[int, ...]) -> dict[str, ImageU8 | ImageU16]:
+def _decode_payload(payload: Payload, known: tuple[int, ...]) -> dict[str, Any]:
     """The image under the name of its RgbdFrame field."""
     if payload.codec_id not in known:
         raise DataError(f"codec {payload.codec_id} is none of this stream's: {known}")
@@ -115,10 +116,11 @@ class FrameDecoder:
                 with self._changed:
                     self._undecodable[frame.camera_id] += 1
                 logger.debug("camera %d, frame %d: %s", frame.camera_id, frame.sequence, error)
+            except Exception:  # the thread's boundary: a bug costs this frame, loudly, and not the others
+                logger.exception("camera %d, frame %d is lost", frame.camera_id, frame.sequence)
             finally:
                 with self._changed:
                     self._busy.discard(frame.camera_id)
-                    self._changed.notify()
 
     def _take(self) -> EncodedFrame | None:
         """Wait for the oldest frame of a camera that no thread works on; None when closed."""
