@@ -131,7 +131,7 @@ def test_a_camera_that_stops_answering_does_not_hang_closing(kinect: VirtualKine
 def test_a_camera_beyond_help_asks_for_a_new_process(
     kinect: VirtualKinect, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(usb_enumerate, "reset", lambda _camera: False)
+    monkeypatch.setattr(usb_enumerate, "reset", lambda _camera: None)
     monkeypatch.setattr(freenect, "_STOP_LIMIT_S", 0.3)
     source = FreenectSource(IMPATIENT)
     kinect.write("mute")

@@ -56,7 +56,8 @@ class FreenectSource:
         ConfigurationError for a missing library or an unclear choice, SourceLost when the Kinect is
         absent, busy, forbidden or silent, RigError when only a new process can help.
         """
-        if any(not thread.stop(0) for thread in _hanging):
+        _hanging[:] = [thread for thread in _hanging if not thread.stop(0)]
+        if _hanging:
             raise RigError("libfreenect hangs in a Kinect that stopped answering: start the agent anew")
         library = load_libfreenect(settings.library)
         self._timeout_s = settings.timeout_s
@@ -122,7 +123,8 @@ class FreenectSource:
         if thread.stop(_STOP_LIMIT_S):
             return
         log.warning("%s does not answer: resetting its USB port", self._camera)
-        if not (usb_bus.reset(self._camera) and thread.stop(_STOP_LIMIT_S)):
+        usb_bus.reset(self._camera)
+        if not thread.stop(_STOP_LIMIT_S):
             _hanging.append(thread)
 
     def __enter__(self) -> Self:

@@ -4,6 +4,7 @@ A Kinect is a hub with a camera and an audio device behind it (model 1414: and a
 model 1473 and K4W report the serial number 000…0; the audio device beside them has a real one.
 """
 
+import logging
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -19,6 +20,8 @@ _REVISION_1414 = 0x010B  # of the device descriptor; libfreenect tells the model
 
 # The name that libfreenect is linked with, so that both ask one and the same library.
 _LIBUSB = "libusb-1.0.so.0"
+
+log = logging.getLogger(__name__)
 
 UsbDevice = Any
 """A `usb.core.Device`; pyusb ships no types."""
@@ -133,18 +136,20 @@ def is_claimed(camera: KinectCamera) -> bool:
     return False
 
 
-def reset(camera: KinectCamera) -> bool:
-    """Reset the camera's USB port; a firmware that stopped answering starts anew. False when it failed."""
+def reset(camera: KinectCamera) -> None:
+    """Reset the camera's USB port, so that a firmware that stopped answering starts anew.
+
+    Calls that wait for the device return with an error, also when the reset itself fails.
+    """
     import usb.core
     import usb.util
 
     try:
         camera.device.reset()
-    except usb.core.USBError:
-        return False
+    except usb.core.USBError as error:
+        log.warning("%s could not be reset: %s", camera, error)
     finally:
         usb.util.dispose_resources(camera.device)
-    return True
 
 
 def _identity(camera: UsbDevice, listed: Sequence[UsbDevice]) -> str | None:

@@ -38,9 +38,6 @@ _LIBFREENECT = "libfreenect.so.0.5"
 _HEADERS = ("/usr/include/libusb-1.0", "/usr/local/include/libusb-1.0")
 _INSTALL = "apt install libfreenect0.5 libusb-1.0-0-dev gcc"
 
-Fault = str
-Model = str
-
 
 @dataclass(frozen=True)
 class KinectFrames:
@@ -73,7 +70,7 @@ def kinect_frames() -> KinectFrames:
 class VirtualKinect:
     """One folder of the bus."""
 
-    def __init__(self, folder: Path, serial: str, model: Model, frames: KinectFrames) -> None:
+    def __init__(self, folder: Path, serial: str, model: str, frames: KinectFrames) -> None:
         self.folder, self.serial, self.model = folder, serial, model
         folder.mkdir()
         self.write("serial", serial)
@@ -122,7 +119,7 @@ class VirtualBus:
         self._count = 0
 
     def add_kinect(
-        self, serial: str, model: Model = "1414", frames: KinectFrames | None = None, plugged: bool = True
+        self, serial: str, model: str = "1414", frames: KinectFrames | None = None, plugged: bool = True
     ) -> VirtualKinect:
         """The next Kinect, at port n+1."""
         folder = self.folder / str(self._count)

@@ -4,9 +4,10 @@
  *   camera_commands.c  what the camera answers to register and parameter commands
  *   motor_commands.c   LED, tilt and accelerometer
  *   iso_stream.c       which packet of which frame crosses the bus in which microframe
- *   libusb_devices.c   libusb API: contexts, enumeration, descriptors, handles
- *   libusb_control.c   libusb API: control and bulk transfers
- *   libusb_transfers.c libusb API: isochronous transfers, event loop
+ *   libusb_devices.c   libusb API: contexts, enumeration, handles
+ *   libusb_descriptors.c  ... device, configuration and string descriptors
+ *   libusb_control.c   ... control and bulk transfers
+ *   libusb_transfers.c ... isochronous transfers, event loop
  *
  * virtual_bus.py describes the folders that make the bus and drives them from tests.
  */
@@ -22,6 +23,7 @@
 #define MAX_KINECTS 8
 #define SLOT_NS 125000LL /* a USB 2 microframe; one isochronous packet per endpoint and microframe */
 #define REGISTERS 0x400
+#define PRODUCT_STRING 1
 
 enum model { MODEL_1414, MODEL_1473, MODEL_K4W };
 enum function { CAMERA, MOTOR, AUDIO, HUB, FUNCTIONS };
@@ -136,6 +138,8 @@ size_t stream_frame_bytes(enum stream_id id);
 
 /* libusb_devices.c */
 struct bus *bus_of_context(libusb_context *context);
+
+/* libusb_descriptors.c */
 const char *device_string(const struct libusb_device *device, int index);
 
 #endif

@@ -1,0 +1,106 @@
+/* libusb API: device, configuration and string descriptors of the three Kinect models. */
+#include "virtual_usb.h"
+
+#include <stdlib.h>
+
+#define UNUSED __attribute__((unused))
+#define MICROSOFT 0x045e
+#define VENDOR_STRING 2
+#define SERIAL_STRING 3
+#define NO_SERIAL "0000000000000000" /* what the cameras of later models report */
+
+static const uint16_t PRODUCTS[][FUNCTIONS] = {
+    [MODEL_1414] = {0x02ae, 0x02b0, 0x02ad, 0x005a},
+    [MODEL_1473] = {0x02ae, 0x02c2, 0x02ad, 0x02c2},
+    [MODEL_K4W] = {0x02bf, 0x02c2, 0x02c3, 0x02c2},
+};
+
+static bool camera_without_serial(const struct libusb_device *device)
+{
+    return device->function == CAMERA && device->kinect->model != MODEL_1414;
+}
+
+const char *device_string(const struct libusb_device *device, int index)
+{
+    static const char *const products[] = {"Xbox NUI Camera", "Xbox NUI Motor", "Xbox NUI Audio", "Hub"};
+    switch (index) {
+    case PRODUCT_STRING:
+        return products[device->function];
+    case VENDOR_STRING:
+        return "Microsoft";
+    case SERIAL_STRING:
+        return camera_without_serial(device) ? NO_SERIAL : device->kinect->serial;
+    default:
+        return NULL;
+    }
+}
+
+int libusb_get_device_descriptor(libusb_device *device, struct libusb_device_descriptor *descriptor)
+{
+    enum model model = device->kinect->model;
+    *descriptor = (struct libusb_device_descriptor){
+        .bLength = LIBUSB_DT_DEVICE_SIZE,
+        .bDescriptorType = LIBUSB_DT_DEVICE,
+        .bcdUSB = 0x200,
+        .bMaxPacketSize0 = 64,
+        .idVendor = MICROSOFT,
+        .idProduct = PRODUCTS[model][device->function],
+        .bcdDevice = model == MODEL_1414 ? 0x010b : 0x0200, /* how drivers tell the models apart */
+        .iProduct = PRODUCT_STRING,
+        .iManufacturer = VENDOR_STRING,
+        .iSerialNumber = device->function == MOTOR ? 0 : SERIAL_STRING,
+        .bNumConfigurations = 1,
+    };
+    return 0;
+}
+
+#define ENDPOINT(address, size)                                                                        \
+    {.bLength = 7, .bDescriptorType = 5, .bmAttributes = 1, .bInterval = 1, .bEndpointAddress = address, \
+     .wMaxPacketSize = size}
+#define INTERFACE(number, ...)                                                                      \
+    {.bLength = 9, .bDescriptorType = 4, .bInterfaceClass = 0xff, .bInterfaceNumber = number, __VA_ARGS__}
+
+static const struct libusb_endpoint_descriptor CAMERA_ENDPOINTS[STREAMS] = {
+    ENDPOINT(0x81, 0x0bc0),
+    ENDPOINT(0x82, 0x0be0),
+};
+static const struct libusb_interface_descriptor INTERFACES[] = {
+    INTERFACE(0, .bNumEndpoints = STREAMS, .endpoint = CAMERA_ENDPOINTS),
+    INTERFACE(0),
+    INTERFACE(1),
+};
+static const struct libusb_interface CAMERA_INTERFACES[] = {{&INTERFACES[0], 1}};
+static const struct libusb_interface OTHER_INTERFACES[] = {{&INTERFACES[1], 1}, {&INTERFACES[2], 1}};
+
+int libusb_get_config_descriptor(
+    libusb_device *device, uint8_t index UNUSED, struct libusb_config_descriptor **out)
+{
+    struct libusb_config_descriptor *config = calloc(1, sizeof *config);
+    *config = (struct libusb_config_descriptor){
+        .bLength = 9,
+        .bDescriptorType = 2,
+        .bNumInterfaces = device->function == AUDIO ? 2 : 1, /* two: its firmware is loaded */
+        .bConfigurationValue = 1,
+        .MaxPower = 8,
+        .interface = device->function == CAMERA ? CAMERA_INTERFACES : OTHER_INTERFACES,
+    };
+    *out = config;
+    return 0;
+}
+
+int libusb_get_active_config_descriptor(libusb_device *device, struct libusb_config_descriptor **out)
+{
+    return libusb_get_config_descriptor(device, 0, out);
+}
+
+void libusb_free_config_descriptor(struct libusb_config_descriptor *config) { free(config); }
+
+int libusb_get_max_iso_packet_size(libusb_device *device UNUSED, unsigned char endpoint)
+{
+    return endpoint == CAMERA_ENDPOINTS[VIDEO].bEndpointAddress ? 1920 : 1760;
+}
+
+int libusb_get_max_packet_size(libusb_device *device, unsigned char endpoint)
+{
+    return libusb_get_max_iso_packet_size(device, endpoint);
+}
