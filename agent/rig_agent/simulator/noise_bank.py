@@ -11,7 +11,7 @@ _MARGIN = (240, 320)  # rows and columns by which windows can move
 _WINDOW = (9, 7)  # columns and rows of the Kinect's correlation window
 # Shares of the variance: the window itself, and a wider part that measured autocorrelations show
 # beyond it (0.1-0.3 at 8-12 px).
-_WINDOW_SHARE, _WIDE_SIGMA_PX = 0.72, 5.0
+_WINDOW_SHARE, _WIDE_SIGMA_PX = 0.6, 6.0
 _BORDER = 24  # smoothing mirrors at the border: cut off what it touched
 
 

@@ -44,7 +44,7 @@ def pattern(rng: np.random.Generator, shape: Shape, texel_m: float) -> Texture:
 
 def paint(rng: np.random.Generator, shape: Shape, texel_m: float) -> Texture:
     """Painted plaster: nearly plain."""
-    base = np.array([0.66, 0.70, 0.74]) + rng.uniform(-0.07, 0.07, 3)
+    base = np.array([0.66, 0.70, 0.74]) + rng.uniform(-0.05, 0.05, 3)
     return _tint(1 + 0.02 * octave_noise(rng, shape, _cells(texel_m, 0.03, 0.12, 0.5)), base)
 
 
@@ -60,7 +60,7 @@ def planks(rng: np.random.Generator, shape: Shape, texel_m: float) -> Texture:
 
 def carpet(rng: np.random.Generator, shape: Shape, texel_m: float) -> Texture:
     """A carpet: fine pile, soft stains."""
-    base = np.array([0.42, 0.40, 0.46]) + rng.uniform(-0.1, 0.1, 3)
+    base = np.array([0.42, 0.40, 0.44]) + rng.uniform(-0.06, 0.06, 3)
     return _tint(1 + 0.07 * octave_noise(rng, shape, _cells(texel_m, 0.008, 0.02, 0.3)), base)
 
 

@@ -1,0 +1,90 @@
+"""Rules of the synthetic source: free-running on a clock, as hardware is."""
+
+import numpy as np
+import pytest
+
+from rig_agent.simulator.ring import VirtualRig
+from rig_agent.simulator.settings import SimulatorSettings
+from rig_agent.sources.base import FrameSource
+from rig_agent.sources.synthetic import SyntheticSource
+from rig_protocol.errors import ConfigurationError
+from rig_protocol.frames import RgbdFrame
+
+SETTINGS = SimulatorSettings(cameras=2, seed=3, frames_rendered=1)
+INTERVAL_NS = 33_333_333
+
+
+class VirtualTime:
+    """A clock that only sleeping moves."""
+
+    def __init__(self) -> None:
+        self.now_ns = 10**12
+
+    def __call__(self) -> int:
+        return self.now_ns
+
+    def sleep(self, seconds: float) -> None:
+        self.now_ns += round(seconds * 1e9)
+
+
+@pytest.fixture(scope="module")
+def clock() -> VirtualTime:
+    return VirtualTime()
+
+
+@pytest.fixture(scope="module")
+def source(clock: VirtualTime) -> FrameSource:
+    """Opening renders the view, so all tests read on from one source."""
+    return SyntheticSource(SETTINGS, 1, clock=clock, sleep=clock.sleep)
+
+
+def read(source: FrameSource) -> RgbdFrame:
+    frame = source.read(1.0)
+    assert frame is not None
+    return frame
+
+
+def test_frames_come_at_the_rate_stamped_when_they_were_taken(
+    source: FrameSource, clock: VirtualTime
+) -> None:
+    stamps, sequences = [], []
+    for _ in range(4):
+        frame = read(source)
+        assert 0 <= clock.now_ns - frame.timestamp_ns < 1000
+        stamps.append(frame.timestamp_ns)
+        sequences.append(frame.sequence)
+    assert np.diff(stamps).tolist() == [INTERVAL_NS] * 3
+    assert np.diff(sequences).tolist() == [1] * 3
+
+
+def test_the_phase_on_the_clock_is_the_cameras_own(source: FrameSource) -> None:
+    rig = VirtualRig(SETTINGS)
+    assert read(source).timestamp_ns % INTERVAL_NS == rig.camera(1).phase_ns
+    assert rig.camera(0).phase_ns != rig.camera(1).phase_ns
+
+
+def test_a_timeout_ends_without_a_frame_and_loses_none(source: FrameSource) -> None:
+    before, skipped = read(source).sequence, source.counters["skipped"]
+    assert source.read(0.001) is None
+    assert read(source).sequence == before + 1
+    assert source.counters["skipped"] == skipped
+
+
+def test_frames_nobody_read_are_skipped_and_counted(source: FrameSource, clock: VirtualTime) -> None:
+    before, skipped = read(source).sequence, source.counters["skipped"]
+    clock.sleep(10.5 * INTERVAL_NS / 1e9)
+    assert read(source).sequence == before + 10
+    assert source.counters["skipped"] == skipped + 9
+
+
+def test_the_description_is_the_factorys(source: FrameSource) -> None:
+    description, kinect = source.describe(), VirtualRig(SETTINGS).camera(1)
+    assert description.model.to_dict() == kinect.model.to_dict()
+    assert description.model.source == "factory"
+    assert (description.color_image, description.depth_image, description.fps) == ("bayer", "raw", 30.0)
+    assert description.serial == kinect.serial
+
+
+def test_a_camera_the_ring_lacks_is_refused() -> None:
+    with pytest.raises(ConfigurationError, match="camera 2"):
+        SyntheticSource(SETTINGS, 2)
