@@ -107,7 +107,7 @@ class AgentLink:
             for request, received_ns in self._clock_requests
         ]
         self._clock_requests.clear()
-        if self._heartbeat_due_ns <= now_ns:
+        if _is_due(self._heartbeat_due_ns, now_ns, HEARTBEAT_INTERVAL_NS):
             self._heartbeat_due_ns = now_ns + HEARTBEAT_INTERVAL_NS
             datagrams.append(encode_message(Heartbeat(self._health), self.session.session_id))
         return datagrams
@@ -221,7 +221,7 @@ class AgentLink:
         self._events.append(Disconnected(text))
 
     def _hello_if_due(self, now_ns: int) -> list[bytes]:
-        if now_ns < self._hello_due_ns:
+        if not _is_due(self._hello_due_ns, now_ns, REFUSED_RETRY_NS[1]):
             return []
         self._hello_due_ns = now_ns + self._hello_retry_ns
         self._hello_retry_ns = min(2 * self._hello_retry_ns, HELLO_RETRY_NS[1])
@@ -233,6 +233,11 @@ class AgentLink:
             nonce = self._nonce_source()
             if nonce:
                 return nonce
+
+
+def _is_due(due_ns: int, now_ns: int, longest_wait_ns: int) -> bool:
+    """True at `due_ns`, and when the clock jumped back so far that it could not be that long."""
+    return now_ns >= due_ns or due_ns - now_ns > longest_wait_ns
 
 
 def _check(prefix: Prefix, data: Buffer) -> str | None:

@@ -94,6 +94,7 @@ class ServerLink:
         self._session_id_source = session_id_source
         self._color_codecs, self._depth_codecs = tuple(color_codecs), tuple(depth_codecs)
         self._datagram_size = datagram_size
+        self._closed = False
         self._statuses: dict[int, CameraStatus] = {}
         self._sessions: dict[int, ServerSession] = {}  # by session id
         self._nonces: dict[int, deque[int]] = {}  # of accepted hellos, by camera id
@@ -148,7 +149,8 @@ class ServerLink:
         return self._events.pop()
 
     def close(self, now_ns: int) -> None:  # noqa: ARG002  # the verbs of both links take the time
-        """End every session with a goodbye, to be fetched with `datagrams_to_send`."""
+        """End every session with a goodbye, to be fetched with `datagrams_to_send`; welcome nobody after."""
+        self._closed = True
         for session in list(self._sessions.values()):
             self._send(Goodbye("the server stops"), session.welcome.session_id, session.address)
             self._end(session, "the server stops")
@@ -222,7 +224,9 @@ class ServerLink:
     # ---- sessions
 
     def _receive_hello(self, prefix: Prefix, datagram: Buffer, address: Address, now_ns: int) -> None:
-        if len(datagram) < MIN_HELLO_SIZE or prefix.id == 0:
+        if self._closed:
+            self.rejected["closed"] += 1
+        elif len(datagram) < MIN_HELLO_SIZE or prefix.id == 0:
             self.rejected["malformed"] += 1
         elif prefix.crc != control_crc(datagram):
             self.rejected["corrupt_control"] += 1

@@ -1,4 +1,4 @@
-"""The bytes of version 1, pinned: another implementation must pass these vectors, ours may never change them."""
+"""The bytes of version 1, pinned: other implementations must pass these vectors, ours never changes them."""
 
 import json
 from pathlib import Path
