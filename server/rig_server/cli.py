@@ -80,14 +80,17 @@ def run(
     changes = {"listen": listen, "capture": {"frames": frames}, "calibration": {"method": method}}
     settings = load_rig_settings(config, changes)
     set_up_logging(settings.log_level)
-    from rig_server import program  # takes a second: after everything that can be refused at once
-    from rig_server.rig import Rig
+    from rig_server.rig import Rig  # takes a second: after everything that can be refused at once
 
     rig = Rig.live(settings) if simulate is None else Rig.simulated(simulate, seed or 0, settings=settings)
     if calibrate:
-        program.calibrate(rig, out or Path("calibration"), Console())
+        from rig_server.calibrating import calibrate_rig
+
+        calibrate_rig(rig, out or Path("calibration"), Console())
     else:
-        program.receive(rig, Console())
+        from rig_server.receiving import receive
+
+        receive(rig, Console())
 
 
 @app.command()

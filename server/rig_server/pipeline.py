@@ -48,7 +48,6 @@ class LivePipeline:
     def __init__(self, settings: RigSettings) -> None:
         self._settings = settings
         self._assembler = Assembler(_synchroniser(settings))
-        self._decoder = FrameDecoder(self._assembler.add, threads=settings.decoder_threads)
         self._link = ServerLink(
             _roster(settings),
             session_id_source=lambda: secrets.randbits(64),
@@ -56,6 +55,8 @@ class LivePipeline:
             depth_codecs=DEPTH_CODECS,
         )
         self._receiver = Receiver(self._link, settings.address, self._on_event, settings.receive_buffer_bytes)
+        # After the port is ours: its first construction on a machine compiles for seconds.
+        self._decoder = FrameDecoder(self._assembler.add, threads=settings.decoder_threads)
         self._rates = RateMeter()
         self._presence = threading.Lock()  # guards what follows
         self._connected: set[int] = set()
@@ -163,7 +164,7 @@ class LivePipeline:
             late=self._assembler.late(camera_id),
             damaged=counters.damaged,
             duplicate=counters.duplicate,
-            corrupt=counters.corrupt,
+            corrupt=counters.corrupt + self._decoder.undecodable_by_camera[camera_id],
             clock_error_us=None if clock is None else clock.uncertainty_ns / 1e3,
             temperature_c=camera.health.get(TEMPERATURE),
         )
@@ -171,8 +172,7 @@ class LivePipeline:
     def _dropped(self) -> dict[str, int]:
         return {
             "sets not taken": self._assembler.overrun,
-            "frames not decoded": self._decoder.dropped,
-            "frames undecodable": self._decoder.undecodable,
+            "frames not decoded in time": self._decoder.dropped,
             "datagrams by the kernel": self._receiver.kernel_drops,
             "datagrams of no camera": sum(self._link.rejected.values()),
         }

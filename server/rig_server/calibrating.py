@@ -1,6 +1,5 @@
-"""What `rig-server` does: receive and show, or calibrate. Talks to the operator through a rich console."""
+"""`rig-server --calibrate`: collect panoramic frames, calibrate, write the files, print the tables."""
 
-import contextlib
 import time
 from collections.abc import Mapping
 from pathlib import Path
@@ -15,29 +14,13 @@ from rig_calib.terminal import calibration_tables, evaluation_table
 from rig_protocol.errors import RigError
 from rig_protocol.poses import Pose
 from rig_protocol.rig_folder import write_true_poses
-from rig_server.live_table import LiveDisplay
 from rig_server.rig import Rig
 from rig_server.sinks.calibrate import CalibrateSink, live_provenance, with_serials
 
 _POLL_S = 0.5
 
 
-def receive(rig: Rig, console: Console) -> None:
-    """Show the live table until Ctrl-C or SIGTERM, the ordinary end."""
-    with (
-        contextlib.suppress(KeyboardInterrupt),
-        rig,
-        LiveDisplay(console, f"rig-server, {rig.place}") as display,
-    ):
-        next_update_s = time.monotonic()
-        while True:
-            rig.next_panorama(_POLL_S)
-            if time.monotonic() >= next_update_s:
-                display.update(rig.status())
-                next_update_s = time.monotonic() + _POLL_S
-
-
-def calibrate(rig: Rig, folder: Path, console: Console) -> None:
+def calibrate_rig(rig: Rig, folder: Path, console: Console) -> None:
     """Wait for the cameras, collect, calibrate, write the files, print the tables.
 
     RigError when cameras do not come, or when the result fails its gate (the files are written then, too).
