@@ -19,21 +19,40 @@ class RayGrid:
 
     x: Plane
     y: Plane
+    x_range: tuple[Plane, Plane]
+    """Least and greatest x of each column."""
+    y_range: tuple[Plane, Plane]
+    """Least and greatest y of each row."""
+
+    @classmethod
+    def of(cls, x: Plane, y: Plane) -> "RayGrid":
+        """A grid with its ranges."""
+        return cls(x, y, (x.min(axis=0), x.max(axis=0)), (y.min(axis=1), y.max(axis=1)))
 
     @property
     def shape(self) -> tuple[int, int]:
         """Rows, columns."""
         return self.x.shape[0], self.x.shape[1]
 
-    def window(self, low: npt.NDArray[np.float64], high: npt.NDArray[np.float64]) -> tuple[slice, slice]:
-        """Rows and columns that may see rays between the corners low (x, y) and high (x, y)."""
-        columns = (self.x.max(axis=0) >= low[0]) & (self.x.min(axis=0) <= high[0])
-        rows = (self.y.max(axis=1) >= low[1]) & (self.y.min(axis=1) <= high[1])
-        return _span(rows), _span(columns)
+    @property
+    def spacing(self) -> float:
+        """Distance of neighbouring samples near the axis, as a tangent."""
+        middle = self.shape[0] // 2
+        return float(self.y[middle + 1, 0] - self.y[middle, 0])
 
-    def crop(self, window: tuple[slice, slice]) -> "RayGrid":
-        """The rays of a window."""
-        return RayGrid(self.x[window], self.y[window])
+    def window(
+        self, low: npt.NDArray[np.float64], high: npt.NDArray[np.float64]
+    ) -> tuple[slice, slice] | None:
+        """Rows and columns that may see rays between the corners low (x, y) and high (x, y), if any do."""
+        rows = np.flatnonzero((self.y_range[1] >= low[1]) & (self.y_range[0] <= high[1]))
+        columns = np.flatnonzero((self.x_range[1] >= low[0]) & (self.x_range[0] <= high[0]))
+        if not rows.size or not columns.size:
+            return None
+        return slice(int(rows[0]), int(rows[-1]) + 1), slice(int(columns[0]), int(columns[-1]) + 1)
+
+    def crop(self, window: tuple[slice, slice]) -> tuple[Plane, Plane]:
+        """x and y of the rays of a window."""
+        return self.x[window], self.y[window]
 
 
 def ray_grid(camera: Intrinsics, samples: int = 1) -> RayGrid:
@@ -54,9 +73,4 @@ def ray_grid(camera: Intrinsics, samples: int = 1) -> RayGrid:
         seen_radius = np.hypot(x, y)
         shrink = np.interp(seen_radius, seen[:rising], radius[:rising]) / np.maximum(seen_radius, 1e-12)
         x, y = x * shrink, y * shrink
-    return RayGrid(x.astype(np.float32), y.astype(np.float32))
-
-
-def _span(mask: npt.NDArray[np.bool_]) -> slice:
-    where = np.flatnonzero(mask)
-    return slice(int(where[0]), int(where[-1]) + 1) if where.size else slice(0, 0)
+    return RayGrid.of(x.astype(np.float32), y.astype(np.float32))

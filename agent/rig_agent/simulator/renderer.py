@@ -16,7 +16,7 @@ from rig_agent.simulator.lens import Plane, RayGrid
 from rig_agent.simulator.scene import Scene
 from rig_agent.simulator.surface import Surface
 from rig_protocol.frames import ImageU8
-from rig_protocol.poses import Pose, inverse
+from rig_protocol.poses import Pose, inverse, transform_points
 
 Matrix = npt.NDArray[np.float64]
 
@@ -35,45 +35,42 @@ class Hits:
 def cast(surfaces: Sequence[Surface], T_room_camera: Pose, rays: RayGrid) -> Hits:
     """First hits of all rays of a camera."""
     hits = Hits(np.zeros(rays.shape, np.float32), np.full(rays.shape, NOTHING, np.int16))
-    T_camera_room = inverse(T_room_camera)
-    for index, surface in enumerate(surfaces):
-        forms = _linear_forms(surface, T_camera_room)
-        if forms is None or (window := _window(surface, T_camera_room, rays)) is None:
-            continue
-        part = rays.crop(window)
-        inverse_z, s, t = (_evaluate(form, part) for form in forms)
-        best = hits.inverse_z[window]
+    for candidate in _candidates(surfaces, T_room_camera, rays):
+        part = rays.crop(candidate.window)
+        inverse_z, s, t = (_evaluate(form, part) for form in candidate.forms)
+        best = hits.inverse_z[candidate.window]
         inside = (inverse_z > best) & (s >= 0) & (s <= inverse_z) & (t >= 0) & (t <= inverse_z)
         np.copyto(best, inverse_z, where=inside)
-        np.copyto(hits.surface[window], np.int16(index), where=inside)
+        np.copyto(hits.surface[candidate.window], np.int16(candidate.index), where=inside)
     return hits
 
 
 def shade(scene: Scene, hits: Hits, T_room_camera: Pose, rays: RayGrid) -> ImageU8:
     """Colour (rows, columns, 3) BGR of what the rays hit, under the scene's lamp."""
     image = np.zeros((*rays.shape, 3), np.uint8)
-    T_camera_room = inverse(T_room_camera)
     counts = np.bincount(hits.surface[hits.surface != NOTHING], minlength=len(scene.surfaces))
-    for index in np.flatnonzero(counts).tolist():
-        surface = scene.surfaces[index]
-        forms = _linear_forms(surface, T_camera_room)
-        window = _window(surface, T_camera_room, rays)
-        if forms is None or window is None:
-            continue
-        part, mask = rays.crop(window), hits.surface[window] == index
-        z = 1 / np.where(mask, hits.inverse_z[window], 1)
-        texture = surface.texture(scene.seed, index, scene.light)
-        texture = _filtered(texture, surface, float(np.median(z[mask])) * _sample_angle(rays) / _slant(forms))
-        rows, columns = texture.shape[:2]
-        sampled = cv2.remap(
-            texture,
-            _evaluate(forms[1], part) * z * columns - 0.5,
-            _evaluate(forms[2], part) * z * rows - 0.5,
-            cv2.INTER_LINEAR,
-            borderMode=cv2.BORDER_REPLICATE,
-        )
-        cv2.copyTo(sampled, mask.astype(np.uint8), image[window])
+    for candidate in _candidates(scene.surfaces, T_room_camera, rays):
+        if counts[candidate.index]:
+            _paint(image[candidate.window], candidate, scene, hits, rays)
     return image
+
+
+def _paint(image: ImageU8, candidate: "_Candidate", scene: Scene, hits: Hits, rays: RayGrid) -> None:
+    """Put one surface's texture where the rays of its window hit it."""
+    surface = scene.surfaces[candidate.index]
+    part, mask = rays.crop(candidate.window), hits.surface[candidate.window] == candidate.index
+    z = 1 / np.where(mask, hits.inverse_z[candidate.window], 1)
+    footprint_m = float(np.median(z[mask])) * rays.spacing / _slant(candidate.forms)
+    texture = _filtered(surface.texture(scene.seed, candidate.index, scene.light), surface, footprint_m)
+    rows, columns = texture.shape[:2]
+    sampled = cv2.remap(
+        texture,
+        _evaluate(candidate.forms[1], part) * z * columns - 0.5,
+        _evaluate(candidate.forms[2], part) * z * rows - 0.5,
+        cv2.INTER_LINEAR,
+        borderMode=cv2.BORDER_REPLICATE,
+    )
+    cv2.copyTo(sampled, mask.astype(np.uint8), image)
 
 
 def cosine_of_incidence(surfaces: Sequence[Surface], hits: Hits, T_room_camera: Pose, rays: RayGrid) -> Plane:
@@ -84,41 +81,53 @@ def cosine_of_incidence(surfaces: Sequence[Surface], hits: Hits, T_room_camera: 
     return np.asarray(np.abs(nx * rays.x + ny * rays.y + nz) / length, dtype=np.float32)
 
 
-def _linear_forms(surface: Surface, T_camera_room: Pose) -> Matrix | None:
-    """Rows (A, B, C) of 1/z, s/z, t/z as functions of the ray; None when the camera sees the back."""
-    R = T_camera_room[:3, :3]
-    corner = R @ surface.corner + T_camera_room[:3, 3]
-    edge_u, edge_v = R @ surface.edge_u, R @ surface.edge_v
+@dataclass(frozen=True, slots=True, eq=False)
+class _Candidate:
+    """A surface that a camera may see: its linear forms 1/z, s/z, t/z (rows) and the window it can cover."""
+
+    index: int
+    forms: Matrix
+    window: tuple[slice, slice]
+
+
+def _candidates(surfaces: Sequence[Surface], T_room_camera: Pose, rays: RayGrid) -> list[_Candidate]:
+    """Surfaces that face the camera and reach into its view."""
+    T_camera_room = inverse(T_room_camera)
+    corners = transform_points(T_camera_room, np.array([surface.corners for surface in surfaces]))
+    forms, facing = _linear_forms(corners)
+    found = []
+    for index in np.flatnonzero(facing & (corners[..., 2].max(axis=1) > _NEAR_M)).tolist():
+        polygon = _in_front(corners[index])
+        flat = polygon[:, :2] / polygon[:, 2:]
+        window = rays.window(flat.min(axis=0), flat.max(axis=0))
+        if window is not None:
+            found.append(_Candidate(index, forms[index], window))
+    return found
+
+
+def _linear_forms(corners: Matrix) -> tuple[Matrix, npt.NDArray[np.bool_]]:
+    """Forms (N,3,3) of rectangles (N,4,3), rows 1/z, s/z, t/z, and which of them show their front (N,)."""
+    origin, edge_u, edge_v = corners[:, 0], corners[:, 1] - corners[:, 0], corners[:, 3] - corners[:, 0]
     normal = np.cross(edge_u, edge_v)
-    distance = normal @ corner
-    if distance >= 0:
-        return None
-    inverse_z = normal / distance
-    dual_u, dual_v = np.cross(edge_v, normal), np.cross(normal, edge_u)
-    dual_u, dual_v = dual_u / (dual_u @ edge_u), dual_v / (dual_v @ edge_v)
-    return np.array(
-        [inverse_z, dual_u - (dual_u @ corner) * inverse_z, dual_v - (dual_v @ corner) * inverse_z]
-    )
+    distance = (normal * origin).sum(axis=1)
+    facing = distance < 0
+    inverse_z = normal / np.where(facing, distance, 1)[:, None]
+    forms = [inverse_z]
+    for edge, dual in ((edge_u, np.cross(edge_v, normal)), (edge_v, np.cross(normal, edge_u))):
+        dual = dual / (dual * edge).sum(axis=1, keepdims=True)
+        forms.append(dual - (dual * origin).sum(axis=1, keepdims=True) * inverse_z)
+    return np.stack(forms, axis=1), facing
 
 
-def _evaluate(form: Matrix, rays: RayGrid) -> Plane:
+def _evaluate(form: Matrix, rays: tuple[Plane, Plane]) -> Plane:
     a, b, c = (np.float32(value) for value in form)
-    return np.asarray(a * rays.x + (b * rays.y + c), dtype=np.float32)
-
-
-def _window(surface: Surface, T_camera_room: Pose, rays: RayGrid) -> tuple[slice, slice] | None:
-    """The part of the image that the surface can cover; None when it is out of sight."""
-    corners = surface.corners @ T_camera_room[:3, :3].T + T_camera_room[:3, 3]
-    polygon = _in_front(corners)
-    if not len(polygon):
-        return None
-    flat = polygon[:, :2] / polygon[:, 2:]
-    rows, columns = rays.window(flat.min(axis=0), flat.max(axis=0))
-    return None if rows.start == rows.stop or columns.start == columns.stop else (rows, columns)
+    return np.asarray(a * rays[0] + (b * rays[1] + c), dtype=np.float32)
 
 
 def _in_front(corners: Matrix) -> Matrix:
     """The polygon (N,3) cut off at the near plane."""
+    if (corners[:, 2] >= _NEAR_M).all():
+        return corners
     kept = []
     for here, after in zip(corners, np.roll(corners, -1, axis=0), strict=True):
         if here[2] >= _NEAR_M:
@@ -127,12 +136,6 @@ def _in_front(corners: Matrix) -> Matrix:
             share = (_NEAR_M - here[2]) / (after[2] - here[2])
             kept.append(here + share * (after - here))
     return np.array(kept)
-
-
-def _sample_angle(rays: RayGrid) -> float:
-    """Angle between neighbouring samples near the axis, rad."""
-    middle = rays.shape[0] // 2
-    return float(rays.y[middle + 1, 0] - rays.y[middle, 0])
 
 
 def _slant(forms: Matrix) -> float:
