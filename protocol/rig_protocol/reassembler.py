@@ -40,14 +40,13 @@ class _UnitKey(NamedTuple):
 class _OpenUnit:
     """A unit that still lacks fragments."""
 
-    __slots__ = ("content", "count", "deadline_ns", "last_size", "missing", "received")
+    __slots__ = ("content", "deadline_ns", "missing", "received")
 
     def __init__(self, header: FragmentHeader, deadline_ns: int) -> None:
         self.deadline_ns = deadline_ns
-        self.count = self.missing = header.fragment_count
-        self.last_size = header.unit_size - (self.count - 1) * header.payload_size
         self.content = bytearray(header.unit_size)
-        self.received = bytearray(self.count)  # one byte a fragment, 1 = held
+        self.missing = header.fragment_count
+        self.received = bytearray(self.missing)  # one byte a fragment, 1 = held
 
 
 class Reassembler:
@@ -72,19 +71,23 @@ class Reassembler:
 
         `first` is the header of the first of them; the others are known to continue it.
         """
+        size = len(run) // count - FRAGMENT_HEADER_SIZE
+        fits = _fits(first, count, size)
+        if count > 1 and not fits:
+            return self._receive_singly(first, run, count, now_ns)
+        if not fits:
+            self._counters.bad_fragment += 1
+            return None
         key = _UnitKey(first.frame_number, first.frame_crc, first.unit_size, first.payload_size)
         unit = self._open.get(key) or self._open_unit(key, first, count, now_ns)
         if unit is None:
             return None
         start, stop = first.fragment_index, first.fragment_index + count
-        size = len(run) // count - FRAGMENT_HEADER_SIZE
-        fits = size == (first.payload_size if stop < unit.count else unit.last_size) and stop <= unit.count
         held = unit.received.count(1, start, stop)
-        if count > 1 and (not fits or held or size != first.payload_size):
+        if count > 1 and held:
             return self._receive_singly(first, run, count, now_ns)
-        if not fits or held:
-            self._counters.duplicate += fits
-            self._counters.bad_fragment += not fits
+        if held:
+            self._counters.duplicate += 1
             return None
         _copy(run, count, unit.content, start * first.payload_size, size)
         unit.received[start:stop] = b"\x01" * count
@@ -169,6 +172,16 @@ class Reassembler:
         self._fates.setdefault(key.frame_number, False)
         if len(self._fates) > _MAX_FATES:
             del self._fates[next(iter(self._fates))]
+
+
+def _fits(first: FragmentHeader, count: int, size: int) -> bool:
+    """True when `count` fragments of `size` payload bytes lie in the unit as SPEC section 3 cuts it."""
+    last = (first.unit_size - 1) // first.payload_size
+    stop = first.fragment_index + count
+    if stop <= last:
+        return size == first.payload_size
+    last_size = first.unit_size - last * first.payload_size
+    return stop == last + 1 and size == last_size and (count == 1 or size == first.payload_size)
 
 
 def _copy(run: Buffer, count: int, content: bytearray, offset: int, size: int) -> None:
