@@ -47,9 +47,9 @@ class AgentSettings(Settings):
     """Where frames come from: a Kinect, a recorded rig folder or the simulator."""
     camera: int | None = Field(None, ge=0, lt=64, examples=[0])
     """Slot of this camera in the ring; unset: the server knows it by serial number or USB port."""
-    name: str | None = Field(None, min_length=1, max_length=64, examples=["cam00"])
+    name: str | None = Field(None, pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]{0,63}$", examples=["cam00"])
     """Name that the operator sees; unset: cam00, cam01, ... after the slot, else this machine's name."""
-    fps: float | None = Field(None, gt=0, le=120, examples=[30.0])
+    fps: float | None = Field(None, ge=0.1, le=120, examples=[30.0])
     """Frames a second to send; unset: as many as the source delivers (a folder: 30)."""
     color: Literal["lossless", "jpeg", "raw"] = "lossless"
     """How colour travels: losslessly compressed, as JPEG, or uncompressed. The server may refuse JPEG."""
@@ -85,7 +85,7 @@ class AgentSettings(Settings):
         """The name, or the one that follows from the slot, or from the machine."""
         if self.name is not None:
             return self.name
-        return platform.node()[:64] if slot is None else f"cam{slot:02d}"
+        return platform.node()[:64] or "agent" if slot is None else f"cam{slot:02d}"
 
 
 def load_agent_settings(file: Path | None, overrides: Mapping[str, Any] | None = None) -> AgentSettings:

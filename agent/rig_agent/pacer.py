@@ -8,8 +8,8 @@ from dataclasses import dataclass
 
 from rig_protocol.datagram import DatagramBatch
 
-# A sender that was late catches up at no more than this many times the paced rate.
-_CATCH_UP = 2
+# A sender that the machine held up sends this many bursts at once, at twice their rate, until it is in time.
+_CATCH_UP = 4
 # A frame still unsent after this many intervals is given up for a newer one: the server gave it up, too.
 _STALE_INTERVALS = 2
 
@@ -60,18 +60,21 @@ class Pacer:
         """The datagrams that are due, or None; tell `sent` how many of them went out."""
         if self._current is None or now_ns < self._due_ns:
             return None
-        datagrams = self._current.part(self._position, self._position + self._burst)
-        return DatagramBatch(datagrams, self._current.segment_size)
+        bursts_due = 1 + (now_ns - self._started_ns) // self._step_ns
+        stop = min(bursts_due * self._burst, self._position + _CATCH_UP * self._burst)
+        return DatagramBatch(self._current.part(self._position, stop), self._current.segment_size)
 
     def sent(self, count: int, now_ns: int) -> None:
         """The network took the first `count` datagrams of the burst; the others stay due."""
         if self._current is None:
             return
         self._position += count
-        self._due_ns = max(self._due_ns + self._step_ns, now_ns + self._step_ns // _CATCH_UP)
         if self._position >= len(self._current):
             self.counters.sent += 1
             self._advance(now_ns)
+            return
+        planned_ns = self._started_ns + self._position // self._burst * self._step_ns
+        self._due_ns = max(planned_ns, now_ns + self._step_ns // 2)
 
     def next_timeout_ns(self) -> int | None:
         """When the next burst is due; None when there is nothing to send."""
@@ -91,4 +94,4 @@ class Pacer:
         bursts = max(1, -(-len(batch) // self._burst))
         self._current, self._position = batch, 0
         self._started_ns = self._due_ns = now_ns
-        self._step_ns = round(self.interval_ns * self._spread / bursts)
+        self._step_ns = max(1, round(self.interval_ns * self._spread / bursts))

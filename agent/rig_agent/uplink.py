@@ -56,7 +56,7 @@ class Uplink:
         """Say hello as this camera from now on; a session of another camera ends."""
         self._say_goodbye(now_ns)
         self._pacer.interval_ns = round(1e9 / hello.fps)
-        self._link = AgentLink(hello, self._datagram_size, lambda: secrets.randbits(64))
+        self._link = AgentLink(hello, self._datagram_size, nonce_source=lambda: secrets.randbits(64))
 
     def fileno(self) -> int | None:
         """For a selector; changes when the transport opens anew."""

@@ -56,7 +56,8 @@ def test_a_file_that_was_asked_for_must_exist() -> None:
         ('server = ":7400"', r"`server`: .*is not HOST or HOST:PORT"),
         ("camera = -1", r"`camera`: .*greater than or equal to 0 \(got -1\)"),
         ("datagram_size = 100", r"`datagram_size`: .*1200 \(got 100\)"),
-        ("fps = 0", r"`fps`: .*greater than 0"),
+        ('name = "two words"', r"`name`: .*pattern"),
+        ("fps = 0", r"`fps`: .*greater than or equal to 0.1"),
     ],
 )
 def test_a_mistake_is_named_with_the_nearest_key(toml: str, message: str) -> None:
