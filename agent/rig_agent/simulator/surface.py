@@ -42,11 +42,6 @@ class Surface:
         c, u, v = self.corner, self.edge_u, self.edge_v
         return np.array([c, c + u, c + u + v, c + v])
 
-    @property
-    def area_m2(self) -> float:
-        """Area of the rectangle."""
-        return float(np.linalg.norm(np.cross(self.edge_u, self.edge_v)))
-
     def texture(self, seed: int, index: int, light: Vector) -> ImageU8:
         """What the surface looks like under the lamp at `light`, (rows, columns, 3) BGR; matt."""
         columns, rows = (
