@@ -8,7 +8,7 @@ from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 from rig_calib.evaluation import evaluate
 
-from rig_calib.outputs import make_output_folder, write_outputs
+from rig_calib.outputs import write_outputs
 from rig_calib.rig_calibration import RigCalibration
 from rig_calib.terminal import calibration_tables, evaluation_table
 from rig_protocol.errors import RigError
@@ -25,7 +25,6 @@ def calibrate_rig(rig: Rig, folder: Path, console: Console) -> None:
 
     RigError when cameras do not come, or when the result fails its gate (the files are written then, too).
     """
-    make_output_folder(folder)
     started_s = time.monotonic()
     with _progress(console) as progress, rig:
         sink = _collect(rig, progress)

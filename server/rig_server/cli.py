@@ -1,13 +1,17 @@
 """The command line of `rig-server`."""
 
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 from rich.console import Console
 
 from rig_protocol.errors import ConfigurationError
 from rig_protocol.programs import run_program, set_up_logging
+
+if TYPE_CHECKING:
+    from rig_server.config import RigSettings
+    from rig_server.rig import Rig
 
 _EXAMPLES = """
 **Examples**
@@ -80,17 +84,17 @@ def run(
     changes = {"listen": listen, "capture": {"frames": frames}, "calibration": {"method": method}}
     settings = load_rig_settings(config, changes)
     set_up_logging(settings.log_level)
-    from rig_server.rig import Rig  # takes a second: after everything that can be refused at once
-
-    rig = Rig.live(settings) if simulate is None else Rig.simulated(simulate, seed or 0, settings=settings)
+    # What takes a second to import comes after everything that can be refused at once.
     if calibrate:
+        from rig_calib.outputs import make_output_folder
         from rig_server.calibrating import calibrate_rig
 
-        calibrate_rig(rig, out or Path("calibration"), Console())
+        make_output_folder(folder := out or Path("calibration"))
+        calibrate_rig(_open_rig(settings, simulate, seed), folder, Console())
     else:
         from rig_server.receiving import receive
 
-        receive(rig, Console())
+        receive(_open_rig(settings, simulate, seed), Console())
 
 
 @app.command()
@@ -109,6 +113,14 @@ def init(
     except OSError as error:
         raise ConfigurationError(f"{path} cannot be written: {error.strerror}") from error
     Console().print(f"wrote {path}; list the cameras in it, then run rig-server", soft_wrap=True)
+
+
+def _open_rig(settings: "RigSettings", simulate: int | None, seed: int | None) -> "Rig":
+    from rig_server.rig import Rig
+
+    if simulate is None:
+        return Rig.live(settings)
+    return Rig.simulated(simulate, seed or 0, settings=settings)
 
 
 def _refuse_options_without_effect(

@@ -143,9 +143,9 @@ class Rig:
 
     def close(self) -> None:
         """End; harmless when already ended."""
+        self._feed.stop()  # first: agents that we end ourselves are no news
         if self._simulation is not None:
             self._simulation.close()
-        self._feed.stop()
 
     def next_panorama(self, timeout_s: float) -> PanoramicFrame | None:
         """The next set; None when none came within `timeout_s`. RigError when the rig broke."""

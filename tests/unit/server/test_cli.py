@@ -5,32 +5,47 @@ import signal
 import socket
 import subprocess
 import sys
+from collections.abc import Callable, Iterator
 from pathlib import Path
 
 import pytest
 
+from rig_server.cli import main
 from rig_server.config import RigSettings, load_rig_settings
 
-
-def rig_server(*words: str, cwd: Path) -> "subprocess.CompletedProcess[str]":
-    command = [sys.executable, "-m", "rig_server.cli", *words]
-    return subprocess.run(command, cwd=cwd, capture_output=True, text=True, timeout=60, check=False)
+Program = Callable[..., int]
 
 
-def test_init_writes_a_file_that_changes_nothing_and_never_overwrites_one(tmp_path: Path) -> None:
-    first = rig_server("init", cwd=tmp_path)
-    assert first.returncode == 0, first.stderr
+@pytest.fixture
+def rig_server(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Program]:
+    """Run the program in this process, in an empty folder; its exit status."""
+    monkeypatch.chdir(tmp_path)
+    handler = signal.getsignal(signal.SIGTERM)
+
+    def run(*words: str) -> int:
+        monkeypatch.setattr(sys, "argv", ["rig-server", *words])
+        with pytest.raises(SystemExit) as ended:
+            main()
+        return int(ended.value.code or 0)
+
+    yield run
+    signal.signal(signal.SIGTERM, handler)
+
+
+def test_init_writes_a_file_that_changes_nothing_and_never_overwrites_one(
+    rig_server: Program, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert rig_server("init") == 0
     assert load_rig_settings(tmp_path / "rig.toml") == RigSettings()
-    again = rig_server("init", cwd=tmp_path)
-    assert again.returncode == 2
-    assert "rig.toml exists" in again.stderr
+    assert rig_server("init") == 2
+    assert "rig.toml exists" in capsys.readouterr().err
 
 
-def test_help_teaches_with_examples(tmp_path: Path) -> None:
-    shown = rig_server("--help", cwd=tmp_path)
-    assert shown.returncode == 0
+def test_help_teaches_with_examples(rig_server: Program, capsys: pytest.CaptureFixture[str]) -> None:
+    assert rig_server("--help") == 0
+    shown = capsys.readouterr().out
     for word in ("--calibrate", "--simulate", "--out", "init", "Examples", "Exit status"):
-        assert word in shown.stdout
+        assert word in shown
 
 
 @pytest.mark.parametrize(
@@ -43,34 +58,39 @@ def test_help_teaches_with_examples(tmp_path: Path) -> None:
         (["--config", "absent.toml"], "absent.toml cannot be read"),
         (["--listen", "192.0.2.1:0"], "no interface of this machine has address 192.0.2.1"),
         (["--simulate", "0"], "--simulate"),
+        (["--calibrate", "--out", "/proc/no"], "cannot write to /proc/no"),
     ],
 )
-def test_wrong_usage_ends_with_status_2_and_says_why(tmp_path: Path, words: list[str], told: str) -> None:
-    refused = rig_server(*words, cwd=tmp_path)
-    assert refused.returncode == 2
-    assert told in refused.stderr
+def test_wrong_usage_ends_with_status_2_and_says_why(
+    rig_server: Program, capsys: pytest.CaptureFixture[str], words: list[str], told: str
+) -> None:
+    assert rig_server(*words) == 2
+    assert told in capsys.readouterr().err
 
 
-def test_a_port_in_use_ends_with_status_1_and_says_what_to_do(tmp_path: Path) -> None:
+def test_a_port_in_use_ends_with_status_1_and_says_what_to_do(
+    rig_server: Program, capsys: pytest.CaptureFixture[str]
+) -> None:
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as other:
         other.bind(("127.0.0.1", 0))
         port = other.getsockname()[1]
-        refused = rig_server("--listen", f"127.0.0.1:{port}", cwd=tmp_path)
-    assert refused.returncode == 1
-    assert f"UDP port {port} is in use" in refused.stderr
+        assert rig_server("--listen", f"127.0.0.1:{port}") == 1
+    assert f"UDP port {port} is in use" in capsys.readouterr().err
 
 
-def test_cameras_that_do_not_come_end_the_calibration_with_status_1_and_their_names(tmp_path: Path) -> None:
-    (tmp_path / "rig.toml").write_text(
-        "listen = '127.0.0.1:0'\n[capture]\nwait_s = 0.5\n[[cameras]]\nid = 0\nname = 'door'\n[[cameras]]\nid = 1\n"
-    )
-    ended = rig_server("--calibrate", cwd=tmp_path)
-    assert ended.returncode == 1
-    assert "2 of 2 cameras have not come: door, cam01" in ended.stderr
+def test_cameras_that_do_not_come_end_the_calibration_with_status_1_and_their_names(
+    rig_server: Program, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    cameras = "[[cameras]]\nid = 0\nname = 'door'\n[[cameras]]\nid = 1\n"
+    (tmp_path / "rig.toml").write_text(f"listen = '127.0.0.1:0'\n[capture]\nwait_s = 0.5\n{cameras}")
+    assert rig_server("--calibrate") == 1
+    assert "2 of 2 cameras have not come: door, cam01" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGINT])
-def test_a_running_server_ends_with_status_0_when_told_to_stop(tmp_path: Path, number: signal.Signals) -> None:
+def test_a_running_server_ends_with_status_0_when_told_to_stop(
+    tmp_path: Path, number: signal.Signals
+) -> None:
     with subprocess.Popen(
         [sys.executable, "-m", "rig_server.cli", "--listen", "127.0.0.1:0"],
         cwd=tmp_path,
