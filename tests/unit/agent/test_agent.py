@@ -1,0 +1,253 @@
+"""Rules of the whole agent over loopback: it outlives the server, the device and bad news."""
+
+import logging
+import os
+import signal
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+from types import TracebackType
+from typing import Self
+
+import numpy as np
+import pytest
+
+from rig_agent.agent import Agent
+from rig_agent.config import AgentSettings, PacingSettings
+from rig_agent.sources.base import FrameSource, SourceDescription, SourceLost
+from rig_protocol.camera import CameraModel, Intrinsics
+from rig_protocol.codecs import codec
+from rig_protocol.errors import DataError
+from rig_protocol.events import CameraJoined, CameraLeft, FrameReceived
+from rig_protocol.frames import RgbdFrame
+from rig_protocol.rig_folder import CameraEntry, RigDescription, write_rig_folder
+from rig_protocol.roster import Roster, Slot
+from support.loopback_server import LoopbackServer
+
+FPS = 100.0
+
+
+class FakeSource:
+    """A FrameSource of small frames, each filled with its number, as fast as `fps` says."""
+
+    def __init__(
+        self, serial: str = "A1", fps: float = FPS, trouble: Callable[[], None] = lambda: None
+    ) -> None:
+        self._serial, self._fps, self._trouble = serial, fps, trouble
+        self._number = 0
+        self.counters: Mapping[str, int] = {}
+        self.closed = False
+
+    def describe(self) -> SourceDescription:
+        return SourceDescription(self._serial, None, CameraModel(), FPS, "bayer", "raw")
+
+    def read(self, timeout_s: float) -> RgbdFrame | None:
+        self._trouble()
+        time.sleep(min(1 / self._fps, timeout_s))
+        number, self._number = self._number, self._number + 1
+        return make_frame(number)
+
+    def close(self) -> None:
+        self.closed = True
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None, /
+    ) -> None:
+        self.close()
+
+
+def make_frame(number: int) -> RgbdFrame:
+    bayer = np.full((48, 64), number % 256, np.uint8)
+    raw = np.arange(48 * 64, dtype=np.uint16).reshape(48, 64) % 2048
+    return RgbdFrame(0, number, time.monotonic_ns(), bayer=bayer, raw=raw)
+
+
+def make_settings(server: LoopbackServer, **changes: object) -> AgentSettings:
+    host, port = server.address
+    return AgentSettings.model_validate({"server": f"{host}:{port}", "camera": 5, **changes})
+
+
+@contextmanager
+def running(settings: AgentSettings, open_source: Callable[[], FrameSource]) -> Iterator[Agent]:
+    """An agent whose `run` is on a thread; stopped at the end."""
+    agent = Agent(settings, open_source)
+    thread = threading.Thread(target=agent.run)
+    thread.start()
+    try:
+        yield agent
+    finally:
+        agent.stop()
+        thread.join(20)
+        assert not thread.is_alive()
+
+
+@pytest.fixture
+def server() -> Iterator[LoopbackServer]:
+    with LoopbackServer() as server:
+        yield server
+
+
+def await_true(condition: Callable[[], bool]) -> None:
+    deadline = time.monotonic() + 20
+    while not condition():
+        assert time.monotonic() < deadline
+        time.sleep(0.01)
+
+
+def test_frames_arrive_bit_exact_under_the_agents_slot(server: LoopbackServer) -> None:
+    with running(make_settings(server), FakeSource):
+        server.wait_for(FrameReceived, 3)
+    frame = server.frames()[2]
+    assert (frame.camera_id, frame.damaged) == (5, False)
+    assert frame.color is not None
+    assert frame.depth is not None
+    sent = make_frame(frame.sequence)
+    np.testing.assert_array_equal(codec(frame.color.codec_id).decode(frame.color.data), sent.bayer)
+    np.testing.assert_array_equal(codec(frame.depth.codec_id).decode(frame.depth.data), sent.raw)
+
+
+def test_the_hello_says_who_the_camera_is(server: LoopbackServer) -> None:
+    with running(make_settings(server, name="door", fps=10.0), FakeSource):
+        hello = server.wait_for(CameraJoined).hello
+    assert (hello.name, hello.camera_id, hello.serial, hello.fps) == ("door", 5, "A1", 10.0)
+    assert hello.software.startswith("kinect-rig ")
+
+
+@pytest.mark.parametrize(
+    ("color", "depth", "names"),
+    [
+        ("lossless", "lossless", ("bayer-lossless", "disparity-lossless")),
+        ("jpeg", "raw", ("bgr-jpeg", "disparity-uncompressed")),
+        ("raw", "lossless", ("bayer-uncompressed", "disparity-lossless")),
+    ],
+)
+def test_images_travel_as_the_settings_say(
+    server: LoopbackServer, color: str, depth: str, names: tuple[str, str]
+) -> None:
+    with running(make_settings(server, color=color, depth=depth), FakeSource):
+        frame = server.wait_for(FrameReceived).frame
+    assert frame.color is not None
+    assert frame.depth is not None
+    assert (codec(frame.color.codec_id).name, codec(frame.depth.codec_id).name) == names
+
+
+def test_stopping_says_goodbye_and_closes_the_source(server: LoopbackServer) -> None:
+    source = FakeSource()
+    with running(make_settings(server), lambda: source):
+        server.wait_for(FrameReceived)
+    assert "goodbye" in server.wait_for(CameraLeft).text
+    assert source.closed
+
+
+@pytest.mark.parametrize("silently", [True, False])
+def test_the_agent_comes_back_when_the_server_restarts(server: LoopbackServer, silently: bool) -> None:
+    with running(make_settings(server), FakeSource) as agent:
+        server.wait_for(FrameReceived)
+        server.stop(silently=silently)
+        with LoopbackServer(server.address) as restarted:
+            restarted.wait_for(FrameReceived, 3)
+            assert restarted.wait_for(CameraJoined).camera_id == 5
+            assert agent.totals.connections == 2
+
+
+def test_the_agent_may_start_before_the_server() -> None:
+    with LoopbackServer() as first:
+        address = first.address
+    with running(AgentSettings(server=f"127.0.0.1:{address[1]}", camera=5), FakeSource) as agent:
+        await_true(lambda: agent.totals.unheard > 0)
+        with LoopbackServer(address) as server:
+            server.wait_for(FrameReceived)
+
+
+def test_a_lost_device_is_reopened_and_the_session_goes_on(server: LoopbackServer) -> None:
+    reads = iter(range(10**9))
+
+    def lose_once() -> None:
+        if next(reads) == 10:
+            raise SourceLost("unplugged")
+
+    with running(make_settings(server), lambda: FakeSource(trouble=lose_once)) as agent:
+        server.wait_for(FrameReceived, 20)
+        assert (agent.totals.source_losses, agent.totals.connections) == (1, 1)
+    sequences = [frame.sequence for frame in server.frames()]
+    assert sequences == sorted(set(sequences))
+
+
+def test_another_device_in_its_place_says_hello_anew(server: LoopbackServer) -> None:
+    serials = iter(["A1", "B2"])
+    reads = iter(range(10**9))
+
+    def lose_once() -> None:
+        if next(reads) == 10:
+            raise SourceLost("unplugged")
+
+    with running(make_settings(server), lambda: FakeSource(next(serials), trouble=lose_once)):
+        assert server.wait_for(CameraJoined, 2).hello.serial == "B2"
+
+
+def test_frames_beyond_what_can_be_sent_are_dropped_and_counted(server: LoopbackServer) -> None:
+    settings = make_settings(server, pacing=PacingSettings(spread=1.0, burst=1))
+    with running(settings, lambda: FakeSource(fps=1000.0)) as agent:
+        server.wait_for(FrameReceived, 20)
+    totals = agent.totals
+    assert totals.dropped > 0
+    in_flight = totals.captured - totals.sent - totals.dropped - totals.unheard
+    assert 0 <= in_flight <= 2 + 2 + 2  # two queues and the two frames of the pacer
+
+
+def test_what_no_retry_cures_ends_the_agent_with_a_goodbye(server: LoopbackServer) -> None:
+    reads = iter(range(10**9))
+
+    def break_later() -> None:
+        if next(reads) == 30:
+            raise DataError("color_003.png is torn")
+
+    agent = Agent(make_settings(server), lambda: FakeSource(trouble=break_later))
+    with pytest.raises(DataError, match=r"color_003.png is torn"):
+        agent.run()
+    assert "goodbye" in server.wait_for(CameraLeft).text
+
+
+def test_a_refusal_is_told_once(caplog: pytest.LogCaptureFixture) -> None:
+    roster = Roster((Slot(0, "cam00"),))
+    with (
+        caplog.at_level(logging.INFO),
+        LoopbackServer(roster=roster) as server,
+        running(make_settings(server), FakeSource),
+    ):
+        server.wait_until(lambda: [None] if server.refusals >= 2 else [])
+    refusals = [message for message in caplog.messages if "UNKNOWN_CAMERA" in message]
+    assert len(refusals) == 1
+    assert "not in the rig" in refusals[0]
+
+
+@pytest.mark.parametrize("ending", [signal.SIGTERM, signal.SIGINT])
+def test_a_signal_ends_the_program_with_a_goodbye_and_status_0(
+    server: LoopbackServer, tmp_path: Path, ending: signal.Signals
+) -> None:
+    model = CameraModel(color=Intrinsics(50, 50, 32, 24, 64, 48), source="file")
+    image = np.zeros((48, 64), np.uint8)
+    frame = RgbdFrame(3, 0, 0, color=image, raw=image.astype(np.uint16))
+    write_rig_folder(tmp_path, RigDescription((CameraEntry(3, "cam03", model),)), [frame])
+    words = ["--source", "folder", "--path", str(tmp_path), "--camera", "3"]
+    program = subprocess.Popen(
+        [sys.executable, "-m", "rig_agent.cli", *words, "--server", f"127.0.0.1:{server.address[1]}"],
+        stderr=subprocess.PIPE,
+        text=True,
+        cwd=tmp_path,
+        env={name: value for name, value in os.environ.items() if not name.startswith("RIG_AGENT_")},
+    )
+    with program:
+        server.wait_for(FrameReceived, 3)
+        program.send_signal(ending)
+        _, log = program.communicate(timeout=20)
+    assert program.returncode == 0, log
+    assert "goodbye" in server.wait_for(CameraLeft).text
+    assert "Traceback" not in log

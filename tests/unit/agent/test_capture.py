@@ -1,0 +1,186 @@
+"""Rules of capture: a lost source is opened again, frames count on, what cannot be cured is reported."""
+
+import logging
+import threading
+from collections.abc import Callable, Iterator, Mapping
+from types import TracebackType
+from typing import Self
+
+import pytest
+
+from rig_agent.capture import Capture
+from rig_agent.frame_queue import FrameQueue
+from rig_agent.sources.base import SourceDescription, SourceLost
+from rig_protocol.camera import CameraModel
+from rig_protocol.errors import DataError
+from rig_protocol.frames import RgbdFrame
+
+DESCRIPTION = SourceDescription("A1", "1-1", CameraModel(), 30.0, "bayer", "raw")
+INTERVAL_NS = 33_333_333
+Step = RgbdFrame | Exception
+
+
+class ScriptedSource:
+    """A FrameSource that plays frames and faults, then falls silent."""
+
+    def __init__(self, steps: list[Step]) -> None:
+        self._steps = iter(steps)
+        self.closed = False
+        self.counters: Mapping[str, int] = {}
+
+    def describe(self) -> SourceDescription:
+        return DESCRIPTION
+
+    def read(self, timeout_s: float) -> RgbdFrame | None:
+        step = next(self._steps, None)
+        if isinstance(step, Exception):
+            raise step
+        if step is None:
+            threading.Event().wait(min(timeout_s, 0.01))
+        return step
+
+    def close(self) -> None:
+        self.closed = True
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None, /
+    ) -> None:
+        self.close()
+
+
+class Recorder:
+    """What capture told its owner."""
+
+    def __init__(self) -> None:
+        self.frames: FrameQueue[RgbdFrame] = FrameQueue(1000)
+        self.opened = 0
+        self.failures: FrameQueue[Exception] = FrameQueue(10)
+
+    def take(self, count: int) -> list[RgbdFrame]:
+        taken = [self.frames.get(5.0) for _ in range(count)]
+        return [frame for frame in taken if frame is not None]
+
+    def count_opened(self, _description: SourceDescription) -> None:
+        self.opened += 1
+
+
+def frames(*sequences: int) -> list[Step]:
+    return [RgbdFrame(0, sequence, sequence * INTERVAL_NS) for sequence in sequences]
+
+
+@pytest.fixture(autouse=True)
+def _quick(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("rig_agent.capture._FIRST_RETRY_S", 0.01)
+
+
+Start = Callable[..., tuple[Capture, Recorder]]
+
+
+@pytest.fixture
+def start() -> Iterator[Start]:
+    """Starts a capture over scripts, one an opening; an exception in their place is a failed opening."""
+    started: list[Capture] = []
+
+    def start(*scripts: list[Step] | Exception, max_fps: float | None = None) -> tuple[Capture, Recorder]:
+        remaining = iter(scripts)
+
+        def open_source() -> ScriptedSource:
+            script = next(remaining, SourceLost("no more scripts"))
+            if isinstance(script, Exception):
+                raise script
+            return ScriptedSource(script)
+
+        recorder = Recorder()
+        capture = Capture(
+            open_source, max_fps, recorder.count_opened, recorder.frames.put, recorder.failures.put
+        )
+        capture.start()
+        started.append(capture)
+        return capture, recorder
+
+    yield start
+    assert all(capture.stop(5.0) for capture in started)
+
+
+def test_frames_pass_in_order(start: Start) -> None:
+    _, recorder = start(frames(0, 1, 2))
+    assert [frame.sequence for frame in recorder.take(3)] == [0, 1, 2]
+
+
+def test_a_lost_source_is_opened_again_and_frames_count_on(start: Start) -> None:
+    capture, recorder = start([*frames(0, 1), SourceLost("unplugged")], frames(0, 1))
+    assert [frame.sequence for frame in recorder.take(4)] == [0, 1, 2, 3]
+    assert (recorder.opened, capture.counters.losses) == (2, 1)
+
+
+def test_gaps_that_the_sensor_left_stay_visible(start: Start) -> None:
+    _, recorder = start([*frames(5, 7), SourceLost("unplugged")], frames(0, 4))
+    assert [frame.sequence for frame in recorder.take(4)] == [0, 2, 3, 7]
+
+
+def test_a_device_that_cannot_be_opened_is_tried_again(start: Start) -> None:
+    capture, recorder = start(SourceLost("busy"), SourceLost("busy"), frames(0))
+    assert len(recorder.take(1)) == 1
+    assert capture.counters.losses == 2
+
+
+def test_the_same_trouble_is_told_once(start: Start, caplog: pytest.LogCaptureFixture) -> None:
+    with caplog.at_level(logging.WARNING):
+        _, recorder = start(SourceLost("busy"), SourceLost("busy"), SourceLost("gone"), frames(0))
+        recorder.take(1)
+    assert [message.partition(";")[0] for message in caplog.messages] == ["busy", "gone"]
+
+
+def test_a_failure_that_no_retry_cures_is_reported_and_ends_the_thread(start: Start) -> None:
+    capture, recorder = start([*frames(0), DataError("torn")])
+    error = recorder.failures.get(5.0)
+    assert isinstance(error, DataError)
+    assert capture.stop(5.0)
+
+
+def test_stopping_closes_the_source() -> None:
+    source = ScriptedSource(frames(0))
+    recorder = Recorder()
+    capture = Capture(lambda: source, None, recorder.count_opened, recorder.frames.put, recorder.failures.put)
+    capture.start()
+    recorder.take(1)
+    assert capture.stop(5.0)
+    assert source.closed
+
+
+def test_damaged_frames_are_counted_and_passed_on(start: Start) -> None:
+    capture, recorder = start([RgbdFrame(0, 0, 0, damaged=True)])
+    assert recorder.take(1)[0].damaged
+    assert capture.counters.damaged == 1
+
+
+@pytest.mark.parametrize(
+    ("max_fps", "kept"),
+    [
+        (None, range(12)),
+        (30.0, range(12)),
+        (60.0, range(12)),
+        (15.0, range(0, 12, 2)),
+        (10.0, range(0, 12, 3)),
+    ],
+)
+def test_a_faster_source_is_thinned_evenly(start: Start, max_fps: float | None, kept: range) -> None:
+    _, recorder = start(frames(*range(12)), max_fps=max_fps)
+    assert [frame.sequence for frame in recorder.take(len(kept))] == list(kept)
+
+
+def test_thinning_to_an_odd_rate_keeps_it_on_average(start: Start) -> None:
+    capture, recorder = start(frames(*range(300), 10**6), max_fps=20.0)
+    assert recorder.take(201)[-1].sequence == 10**6
+    assert capture.counters.captured == 201
+
+
+def test_a_full_queue_drops_the_oldest_and_counts_it() -> None:
+    queue: FrameQueue[int] = FrameQueue(2)
+    for item in range(5):
+        queue.put(item)
+    assert queue.dropped == 3
+    assert [queue.get(), queue.get(), queue.get()] == [3, 4, None]
