@@ -1,7 +1,8 @@
-"""A recorded Kinect on a virtual USB bus, through the unmodified libfreenect, the agent and UDP, to the server."""
+"""A recorded Kinect on a virtual USB bus, through libfreenect as it is, the agent and UDP, to the server."""
 
 import time
 from collections.abc import Iterator
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -54,7 +55,7 @@ def test_recorded_frames_arrive_byte_exact_at_30_fps(kinect: VirtualKinect, port
     indices = [recorded_index(panorama) for panorama in panoramas]
     assert lost == 0
     count = len(kinect_frames().raw)
-    assert all((after - before) % count == 1 for before, after in zip(indices, indices[1:], strict=False))
+    assert all((after - before) % count == 1 for before, after in pairwise(indices))
     elapsed_s = (panoramas[-1].timestamp_ns - panoramas[0].timestamp_ns) / 1e9
     assert (RATE_WINDOW - 1) / elapsed_s == pytest.approx(30.0, abs=0.3)
     assert kinect.log()

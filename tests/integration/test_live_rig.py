@@ -14,6 +14,7 @@ from rig_server import Rig
 from support.rig_processes import (
     LOOPBACK,
     AgentProcess,
+    any_set,
     folder_agents,
     free_port,
     holds_only_written_images,
@@ -74,7 +75,7 @@ def test_loss_and_reordering_cost_frames_but_never_a_wrong_pixel(
         folder_agents(folder, tmp_path, relay.port, FEW),
     ):
         rig.wait_for_cameras(60)
-        seen = [wait_for_set(rig, lambda panorama: True) for _ in range(40)]
+        seen = [wait_for_set(rig, any_set) for _ in range(40)]
         status = rig.status()
     assert all(holds_only_written_images(panorama, frames) for panorama in seen)
     assert any(panorama.complete for panorama in seen)
@@ -113,9 +114,8 @@ def test_an_agent_that_stops_says_goodbye(few_agents: dict[int, AgentProcess], p
         assert [camera.connected for camera in rig.status().cameras] == [True, True, False]
 
 
-def test_garbage_and_other_versions_do_not_touch_the_stream(
-    few_agents: dict[int, AgentProcess], port: int
-) -> None:
+@pytest.mark.usefixtures("few_agents")
+def test_garbage_and_other_versions_do_not_touch_the_stream(port: int) -> None:
     with Rig.live(server_settings(port, len(FEW))) as rig:
         wait_for_set(rig, is_complete)
         lost_before = sum(camera.lost for camera in rig.status().cameras)

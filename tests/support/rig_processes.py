@@ -146,6 +146,11 @@ def wait_for_set(
     raise AssertionError(f"no such set within {timeout_s:.0f} s; {missing}; {rig.status()}")
 
 
+def any_set(panorama: PanoramicFrame) -> bool:  # noqa: ARG001  # a condition for wait_for_set
+    """Whatever comes."""
+    return True
+
+
 def is_complete(panorama: PanoramicFrame) -> bool:
     """Every camera delivered."""
     return panorama.complete

@@ -1,4 +1,4 @@
-"""A bad network between real sockets: a relay in front of the server that harms datagrams as LossyLink does."""
+"""A bad network between real sockets: a relay before the server that harms datagrams as LossyLink does."""
 
 import selectors
 import socket
@@ -15,7 +15,7 @@ _IDLE_S = 0.02
 
 
 class UdpRelay:
-    """Agents speak to `port`; each gets a socket of its own towards the server, so that addresses stay apart."""
+    """Agents speak to `port`; each gets a socket of its own towards the server, which tells them apart."""
 
     def __init__(self, server: tuple[str, int], faults: Faults, seed: int = 1) -> None:
         self._server, self._faults, self._seed = server, faults, seed
