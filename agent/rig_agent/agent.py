@@ -16,7 +16,7 @@ from rig_agent.capture import Capture
 from rig_agent.config import AgentSettings
 from rig_agent.encoder import encode_frame
 from rig_agent.frame_queue import FrameQueue
-from rig_agent.health import HealthLog, Totals
+from rig_agent.health import HealthLog, Totals, gauges
 from rig_agent.hello import make_hello
 from rig_agent.sources.base import FrameSource, SourceDescription
 from rig_agent.transport import now_ns
@@ -28,6 +28,7 @@ from rig_protocol.messages import Hello, Welcome
 _log = logging.getLogger(__name__)
 
 _QUEUE_FRAMES = 2  # covers one hiccup of the next stage; older frames are stale
+_GAUGES_INTERVAL_NS = 1_000_000_000
 _TICK_S = 0.5  # how soon a thread notices that it should end
 _HUNG_NS = 60_000_000_000  # a driver call that takes longer will not return
 _STOP_TIMEOUT_S = 5.0  # closing a Kinect takes a few seconds at most
@@ -91,7 +92,7 @@ class Agent:
     # ---- network loop: the caller's thread
 
     def _serve_network(self) -> None:
-        time_ns = now_ns()
+        time_ns = gauges_due_ns = now_ns()
         health = HealthLog(self._settings.report_interval_s, time_ns)
         watchdog = service.Watchdog()
         service.notify("READY=1")
@@ -100,6 +101,9 @@ class Agent:
             time_ns = now_ns()
             self._forward(time_ns)
             watchdog.feed(time_ns)
+            if time_ns >= gauges_due_ns:
+                gauges_due_ns = time_ns + _GAUGES_INTERVAL_NS
+                self._uplink.report_health(gauges(self.totals))
             if time_ns >= health.due_ns:
                 _log.info("%s", health.line(self.totals, self._welcome is not None, time_ns))
             if time_ns - self._capture.last_sign_ns > _HUNG_NS:

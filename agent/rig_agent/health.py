@@ -1,6 +1,9 @@
-"""How the agent is doing: totals of every stage, and one line for the log now and then."""
+"""How the agent is doing: totals of every stage, gauges for the server, a line for the log now and then."""
 
 from dataclasses import dataclass
+from pathlib import Path
+
+_PROCESSOR_TEMPERATURE = Path("/sys/class/thermal/thermal_zone0/temp")  # in 1/1000 °C, on a Pi and most PCs
 
 
 @dataclass(frozen=True, slots=True)
@@ -23,6 +26,20 @@ class Totals:
     """Times that the device was lost or could not be opened."""
     network_errors: int = 0
     """Sends that the network refused."""
+
+
+def gauges(totals: Totals) -> dict[str, float]:
+    """What the server's operator may want to see of this agent, by name."""
+    found: dict[str, float] = {
+        "dropped": totals.dropped,
+        "damaged": totals.damaged,
+        "source_losses": totals.source_losses,
+    }
+    try:
+        found["temperature_c"] = int(_PROCESSOR_TEMPERATURE.read_text()) / 1000
+    except (OSError, ValueError):
+        return found  # this machine does not tell
+    return found
 
 
 class HealthLog:

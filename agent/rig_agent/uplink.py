@@ -2,6 +2,7 @@
 
 import logging
 import secrets
+from collections.abc import Mapping
 
 from rig_agent.config import AgentSettings
 from rig_agent.pacer import Pacer
@@ -57,6 +58,11 @@ class Uplink:
         self._say_goodbye(now_ns)
         self._pacer.interval_ns = round(1e9 / hello.fps)
         self._link = AgentLink(hello, self._datagram_size, nonce_source=lambda: secrets.randbits(64))
+
+    def report_health(self, gauges: Mapping[str, float]) -> None:
+        """What the next heartbeats tell the server."""
+        if self._link is not None:
+            self._link.report_health(gauges)
 
     def fileno(self) -> int | None:
         """For a selector; changes when the transport opens anew."""
