@@ -60,7 +60,7 @@ def _collect(rig: Rig, progress: Progress) -> CalibrateSink:
     rig.wait_for_cameras(capture.wait_s, lambda status: progress.update(waiting, completed=status.connected))
     connected = rig.status().connected
     progress.update(waiting, description="cameras connected", completed=connected, total=connected)
-    sink = CalibrateSink(capture.frames)
+    sink = CalibrateSink(capture.frames, rig.description.camera_ids)
     collecting = progress.add_task("panoramic frames", total=capture.frames)
     until_s = time.monotonic() + capture.wait_s
     wanted = True

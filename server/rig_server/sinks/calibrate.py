@@ -2,7 +2,7 @@
 
 import dataclasses
 import platform
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from datetime import UTC, datetime
 from importlib.metadata import version
 from typing import Any
@@ -21,20 +21,24 @@ _LIBRARIES = ("kinect-rig", "numpy", "scipy", "opencv-python-headless")
 
 
 class CalibrateSink:
-    """Wants `count` complete sets; keeps the least incomplete partial ones for want of better."""
+    """Wants `count` sets that hold an undamaged frame of each of the `cameras`.
 
-    def __init__(self, count: int) -> None:
+    Keeps the least incomplete of the others for want of better.
+    """
+
+    def __init__(self, count: int, cameras: Iterable[int]) -> None:
         self._count = count
+        self._cameras = tuple(cameras)
         self._complete: list[PanoramicFrame] = []
         self._partial: list[PanoramicFrame] = []
 
     def take(self, panorama: PanoramicFrame) -> bool:
         """Keep the set; False when there are enough complete ones."""
-        if panorama.complete:
+        if not self._lacking(panorama):
             self._complete.append(panorama)
         else:
-            fewest_missing = sorted([*self._partial, panorama], key=lambda one: len(one.missing))
-            self._partial = fewest_missing[: self._count]
+            best_first = sorted([*self._partial, panorama], key=lambda one: len(self._lacking(one)))
+            self._partial = best_first[: self._count]
         return len(self._complete) < self._count
 
     @property
@@ -51,7 +55,7 @@ class CalibrateSink:
             )
         spare = self._partial[: self._count - len(self._complete)]
         chosen = sorted([*self._complete, *spare], key=lambda panorama: panorama.index)
-        return chosen, _warnings(len(chosen), spare)
+        return chosen, self._warnings(len(chosen), spare)
 
     def calibrate(
         self,
@@ -72,6 +76,21 @@ class CalibrateSink:
         )
         return dataclasses.replace(result, calibration=calibration), views
 
+    def _lacking(self, panorama: PanoramicFrame) -> list[int]:
+        """Cameras of which the set holds no frame, or a damaged one."""
+        frames = ((camera_id, panorama.frames.get(camera_id)) for camera_id in self._cameras)
+        return [camera_id for camera_id, frame in frames if frame is None or frame.damaged]
+
+    def _warnings(self, frames: int, spare: Sequence[PanoramicFrame]) -> tuple[str, ...]:
+        if not spare:
+            return ()
+        lacking = sorted({camera_id for panorama in spare for camera_id in self._lacking(panorama)})
+        warning = (
+            f"{len(spare)} of {frames} panoramic frames were partial: complete sets did not come in time; "
+            f"missing or damaged at times: cameras {', '.join(map(str, lacking))}"
+        )
+        return (warning,)
+
 
 def live_provenance(settings: RigSettings, hellos: Mapping[int, Hello], source: str) -> dict[str, Any]:
     """What a result remembers of its input: source, agents, versions and the effective settings."""
@@ -91,14 +110,3 @@ def with_serials(calibration: RigCalibration, hellos: Mapping[int, Hello]) -> Ri
         for camera in calibration.cameras
     )
     return dataclasses.replace(calibration, cameras=cameras)
-
-
-def _warnings(frames: int, partial: list[PanoramicFrame]) -> tuple[str, ...]:
-    if not partial:
-        return ()
-    missing = sorted({camera_id for panorama in partial for camera_id in panorama.missing})
-    warning = (
-        f"{len(partial)} of {frames} panoramic frames were partial: complete sets did not come in time; "
-        f"missing at times: cameras {', '.join(map(str, missing))}"
-    )
-    return (warning,)
