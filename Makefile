@@ -18,6 +18,9 @@ lint: $(READY)  ## style, types, import rules
 	$(BIN)/mypy
 	$(BIN)/lint-imports
 
+bench-codecs: $(READY)  ## sizes and times of the codecs, into docs/performance.md
+	$(BIN)/python tests/benchmarks/bench_codecs.py
+
 clean:  ## everything that make built
 	rm -rf $(VENV) build
 

