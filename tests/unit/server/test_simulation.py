@@ -51,10 +51,9 @@ def test_an_agent_that_dies_ends_the_run_with_its_log() -> None:
     simulation = Simulation(1, -1, 5.0, ("127.0.0.1", 9))  # a seed that the agent refuses
     simulation.start()
     try:
+        simulation._agents[0].wait(30)
         with pytest.raises(RigError, match=r"(?s)simulated agent 0 ended with status 2.*seed"):
-            for _ in range(600):
-                simulation.check()
-                time.sleep(0.05)
+            simulation.check()
     finally:
         simulation.close()
 
