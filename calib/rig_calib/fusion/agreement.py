@@ -5,7 +5,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 import numpy.typing as npt
 
-from rig_calib.fusion.surface import Surface
+from rig_calib.fusion.surface import Array32, Surface, in_field, sample_image
 from rig_calib.projection import inside, project
 from rig_protocol.camera import Intrinsics
 from rig_protocol.poses import Pose, inverse, transform_points
@@ -39,26 +39,27 @@ def overlap_differences_m(
     return found
 
 
-def _depth_map(surface: Surface, camera: Intrinsics) -> Array:
+def _depth_map(surface: Surface, camera: Intrinsics) -> Array32:
     """Mean depth of the surface's points in each cell of its camera's image, NaN where there are none."""
     points = surface.points_m.astype(np.float64)
     shape = (camera.height // _CELL_PX + 1, camera.width // _CELL_PX + 1)
-    index = _cell_index(project(camera, points), shape)
+    cells = np.rint(_in_cells(project(camera, points))).astype(np.intp)
+    columns, rows = np.clip(cells, 0, np.array(shape[::-1]) - 1).T
+    index = rows * shape[1] + columns
     count = np.bincount(index, minlength=shape[0] * shape[1])
     with np.errstate(invalid="ignore"):  # 0/0 is the NaN that marks an empty cell
-        return np.asarray(np.bincount(index, points[:, 2], shape[0] * shape[1]) / count).reshape(shape)
+        mean = np.bincount(index, points[:, 2], shape[0] * shape[1]) / count
+    return mean.reshape(shape).astype(np.float32)
 
 
-def _differences(points: Array, camera: Intrinsics, depth_map: Array) -> Array:
-    points = points[points[:, 2] > 0.1]
+def _differences(points: Array, camera: Intrinsics, depth_map: Array32) -> Array:
+    points = points[in_field(camera, points)]
     pixels = project(camera, points)
     seen = inside(camera, pixels)
-    measured = depth_map.ravel()[_cell_index(pixels[seen], depth_map.shape)]
-    difference = np.abs(measured - points[seen, 2])
+    difference = np.abs(sample_image(depth_map, _in_cells(pixels[seen])) - points[seen, 2])
     return np.asarray(difference[difference < _SAME_SURFACE_M])
 
 
-def _cell_index(pixels: Array, shape: tuple[int, ...]) -> npt.NDArray[np.intp]:
-    cells = np.floor((pixels[:, ::-1] + 0.5) / _CELL_PX).astype(np.intp)
-    cells = np.clip(cells, 0, np.array(shape) - 1)
-    return np.asarray(cells[:, 0] * shape[1] + cells[:, 1])
+def _in_cells(pixels: Array) -> Array:
+    """Coordinates in units of cells, whose centres are at integers."""
+    return np.asarray((pixels + 0.5) / _CELL_PX - 0.5)

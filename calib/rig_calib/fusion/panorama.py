@@ -14,6 +14,7 @@ from rig_calib.fusion.surface import (
     Surface,
     camera_surfaces,
     frames_of,
+    in_field,
     mean_color,
     sample_colors,
 )
@@ -32,7 +33,7 @@ Mask = npt.NDArray[np.bool_]
 DEFAULT_CIRCLE_PX = 3000
 """Columns of a full circle: about the angular resolution of a Kinect's colour camera."""
 
-_COS_HALF_FIELD = np.cos(np.deg2rad(45.0))  # no Kinect sees farther from its axis
+_COS_ASIDE = np.cos(np.deg2rad(60.0))  # what is farther from a camera's axis is not even looked at
 _SEAM_POWER = 4.0  # how fast a camera's weight falls towards its border: sharp enough not to ghost
 _HIDDEN_WEIGHT = 1e-6  # a camera from which a pixel is hidden colours it only where no other can
 
@@ -108,10 +109,10 @@ class _Layer:
         intrinsics = self.view.model.color
         index = _towards(points, self.T_view_camera)
         local = transform_points(inverse(self.T_view_camera), points.reshape(-1, 3)[index].astype(np.float64))
-        ahead = local[:, 2] > 0.05
-        index, local = index[ahead], local[ahead]
+        shown = in_field(intrinsics, local)
+        index, local = index[shown], local[shown]
         pixels = project(intrinsics, local)
-        seen = inside(intrinsics, pixels, margin_px=-0.5)
+        seen = inside(intrinsics, pixels)
         index, local, pixels = index[seen], local[seen], pixels[seen]
         own = self.surface.points_m.astype(np.float64)
         buffer = DepthBuffer.of(project(intrinsics, own), own[:, 2])
@@ -149,10 +150,10 @@ def _render_distance(
 
 
 def _towards(points: Array32, T_view_camera: Pose) -> npt.NDArray[np.intp]:
-    """Flat indices of the panorama points within a Kinect's field around the optical axis."""
+    """Flat indices of the panorama points that lie roughly where the camera looks."""
     axis = T_view_camera[:3, 2].astype(np.float32)
     along = points @ axis
-    return np.flatnonzero(along > _COS_HALF_FIELD * np.linalg.norm(points, axis=-1))
+    return np.flatnonzero(along > _COS_ASIDE * np.linalg.norm(points, axis=-1))
 
 
 def _centre_weight(intrinsics: Intrinsics, pixels: Array) -> Array:

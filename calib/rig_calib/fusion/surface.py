@@ -16,9 +16,10 @@ from rig_calib.depth_model import (
     disparity_image,
     grid_points,
 )
-from rig_calib.projection import from_pixels, inside, project
+from rig_calib.projection import from_pixels, inside, pixel_rays, project
 from rig_calib.rig_calibration import RigCalibration
 from rig_calib.view import CameraView
+from rig_protocol.camera import Intrinsics
 from rig_protocol.frames import ImageU8
 from rig_protocol.poses import Pose, transform_points
 
@@ -34,6 +35,7 @@ _MAX_FLICKER = 1.5  # raw steps of standard deviation over frames, three times t
 # The bilateral filter spans the 9×9 correlation window and keeps steps above three raw steps.
 _SMOOTH_WINDOW_PX, _SMOOTH_SIGMA_PX, _SMOOTH_SIGMA_STEPS = 9, 3.0, 1.5
 _HIDDEN_RATIO = 1.03  # a point this much farther than another on its colour pixel is hidden behind it
+_FIELD_MARGIN = 1.02  # half a pixel beyond the corner is still the corner
 _OCCLUSION_CELL_PX = 4  # colour pixels a cell of the occlusion test
 
 
@@ -116,7 +118,7 @@ def camera_surface(
     pixels = np.column_stack([columns, rows])
     points, depth_m = grid_points(grid, pixels, disparity[rows, columns], correction)
     color_pixels = project(view.model.color, points)
-    seen = inside(view.model.color, color_pixels, margin_px=-0.5)
+    seen = inside(view.model.color, color_pixels, margin_px=-0.5) & in_field(view.model.color, points)
     seen[seen] = _unhidden(color_pixels[seen], points[seen, 2])
     sigma = depth_sigma_m(grid.raw_model, depth_m, rounded_to_mm=not view.raw) / incidence[rows, columns]
     return Surface(
@@ -180,13 +182,30 @@ def mean_color(images: Sequence[ImageU8]) -> Array32:
 
 def sample_colors(image: Array32, pixels: Array) -> ImageU8:
     """Colours (N,3) u8 of an image (H,W,3) at sub-pixel positions (N,2), bilinear."""
+    return np.asarray(np.clip(np.rint(sample_image(image, pixels)), 0, 255), dtype=np.uint8)
+
+
+def sample_image(image: Array32, pixels: Array) -> Array32:
+    """Values (N,) or (N,C) of an image (H,W) or (H,W,C) at sub-pixel positions (N,2), bilinear.
+
+    Beyond the border the border's value holds.
+    """
     # remap takes no list longer than 32767, so that the list becomes a nearly square map.
     width = max(1, int(np.ceil(np.sqrt(len(pixels)))))
-    maps = np.zeros((width * width, 2), np.float32)
-    maps[: len(pixels)] = pixels
-    sampled = cv2.remap(image, maps.reshape(width, width, 2), None, cv2.INTER_LINEAR)  # type: ignore[call-overload]
-    colors = np.clip(np.rint(sampled.reshape(-1, 3)[: len(pixels)]), 0, 255)
-    return np.asarray(colors, dtype=np.uint8)
+    maps = np.zeros((width, width, 2), np.float32)
+    maps.reshape(-1, 2)[: len(pixels)] = pixels
+    sampled = cv2.remap(image, maps[..., 0], maps[..., 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    return np.asarray(sampled.reshape(width * width, *image.shape[2:])[: len(pixels)], dtype=np.float32)
+
+
+def in_field(intrinsics: Intrinsics, points: Array) -> Mask:
+    """Which points (N,3) of the camera frame are before it and no farther off its axis than its corners.
+
+    Farther out a distortion polynomial means nothing, and may fold points back into the image.
+    """
+    corner = float(np.nanmax(np.linalg.norm(pixel_rays(intrinsics), axis=-1)))
+    tangent = corner * _FIELD_MARGIN
+    return np.asarray(np.hypot(points[:, 0], points[:, 1]) <= tangent * points[:, 2])
 
 
 def _solid(disparity: Array, incidence: Array) -> Mask:
