@@ -14,7 +14,8 @@ from rig_protocol.events import Address, AgentEvent, ServerEvent
 from rig_protocol.frames import EncodedFrame
 from rig_protocol.server_link import ServerLink
 
-_LARGEST_BIT_ERROR = 3  # bits flipped in one datagram
+_MOST_BIT_ERRORS = 3  # in one corrupt datagram
+_CUT_SHARE = 0.2  # of corrupt datagrams lose their end instead
 _NEVER_NS = 2**63
 
 
@@ -90,11 +91,12 @@ class LossyLink:
         return happens
 
     def _corrupted(self, datagram: bytes) -> bytes:
-        if self._random.random() < 0.2:
-            return datagram[: self._random.randrange(len(datagram))]
+        if not datagram or self._random.random() < _CUT_SHARE:
+            return datagram[: self._random.randrange(max(1, len(datagram)))]
         harmed = bytearray(datagram)
-        for _ in range(self._random.randint(1, _LARGEST_BIT_ERROR)):
-            harmed[self._random.randrange(len(harmed))] ^= 1 << self._random.randrange(8)
+        bits = range(8 * len(datagram))
+        for bit in self._random.sample(bits, min(self._random.randint(1, _MOST_BIT_ERRORS), len(bits))):
+            harmed[bit // 8] ^= 1 << bit % 8
         return bytes(harmed)
 
 
