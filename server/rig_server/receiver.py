@@ -1,7 +1,7 @@
 """The receiver: the server's only socket and clock, in a thread of its own around the link.
 
-Linux hands over several datagrams of one sender in one call (UDP_GRO); where the kernel lacks it, each
-call gives one datagram and everything else stays the same.
+Linux hands over several datagrams of one sender in one call (UDP_GRO). Where it does not, each call gives
+one datagram, and what waits of one sender is gathered here: the link gets batches either way.
 """
 
 import errno
@@ -11,12 +11,13 @@ import socket
 import struct
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from typing import Protocol
 
 from rig_protocol.datagram import DatagramBatch
 from rig_protocol.errors import ConfigurationError, RigError
 from rig_protocol.events import Address, ServerEvent
+from rig_server.gatherer import Gatherer
 
 logger = logging.getLogger(__name__)
 
@@ -88,6 +89,7 @@ class Receiver:
         self.unsent = 0  # control datagrams that the network refused
         self.failure: Exception | None = None
         self._buffer = bytearray(_MAX_RECEIVE)
+        self._gatherer = Gatherer()
         self._wake_receiver, self._waker = socket.socketpair()
         self._stopping = threading.Event()
         self._thread = threading.Thread(target=self._run, name="receiver", daemon=True)
@@ -135,20 +137,33 @@ class Receiver:
             try:
                 size, ancillary, _, address = self._socket.recvmsg_into([self._buffer], _ANCILLARY_SIZE)
             except BlockingIOError:
-                return
+                break
             except ConnectionError:  # an agent's host told us that nobody listens there any more
                 continue
-            now_ns = rig_time_ns()
-            segment_size = size
-            for level, kind, data in ancillary:
-                if level == socket.IPPROTO_UDP and kind == _UDP_GRO:
-                    segment_size = _leading_int(data)
-                elif level == socket.SOL_SOCKET and kind == _SO_RXQ_OVFL:
-                    self.kernel_drops = _leading_int(data)
-            if size:
-                batch = DatagramBatch(memoryview(self._buffer)[:size], segment_size)
-                self._link.receive_batch(batch, address[:2], now_ns)
-                self._deliver_events()
+            segment_size = self._read_ancillary(ancillary) or size
+            received, sender = memoryview(self._buffer)[:size], address[:2]
+            if segment_size < size:
+                self._hand_over(self._gatherer.flush(sender), sender)
+                self._hand_over((DatagramBatch(received, segment_size),), sender)
+            elif size:
+                self._hand_over(self._gatherer.add(received, sender), sender)
+        for batch, sender in self._gatherer.flush_all():
+            self._hand_over((batch,), sender)
+
+    def _read_ancillary(self, ancillary: list[tuple[int, int, bytes]]) -> int | None:
+        """Note the drop counter; the size of merged datagrams, where the kernel told one."""
+        segment_size = None
+        for level, kind, data in ancillary:
+            if level == socket.IPPROTO_UDP and kind == _UDP_GRO:
+                segment_size = _leading_int(data)
+            elif level == socket.SOL_SOCKET and kind == _SO_RXQ_OVFL:
+                self.kernel_drops = _leading_int(data)
+        return segment_size
+
+    def _hand_over(self, batches: Iterable[DatagramBatch], sender: Address) -> None:
+        for batch in batches:
+            self._link.receive_batch(batch, sender, rig_time_ns())
+            self._deliver_events()
 
     def _serve_link(self) -> None:
         due_ns, now_ns = self._link.next_timeout_ns(), rig_time_ns()

@@ -107,7 +107,7 @@ def test_every_datagram_arrives_whole_and_in_order_merged_or_not(
     datagrams = [datagram for batch in rigged.link.batches for datagram in batch]
     assert b"".join(datagrams) == data
     assert [len(datagram) for datagram in datagrams] == [1472] * 6 + [10240 - 6 * 1472]
-    assert use_gro or len(rigged.link.batches) == 7
+    assert use_gro or not rigged.receiver.merges
 
 
 def test_several_datagrams_come_in_one_batch_where_the_kernel_merges(sender: socket.socket) -> None:
