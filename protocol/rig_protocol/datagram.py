@@ -50,6 +50,8 @@ FRAGMENT_HEADER = np.dtype(
 # which fills the top 16 bits of the last word.
 _WORDS = FRAGMENT_HEADER_SIZE // 8
 _NEXT_FRAGMENT = np.array([0, 0, 0, 1 << 48], dtype="<u8")
+# Taking a few datagrams one by one costs less than comparing their headers.
+_WORTH_COMPARING = 4
 
 
 class MessageType(IntEnum):
@@ -163,10 +165,10 @@ def write_fragment_headers(first: FragmentHeader, rows: npt.NDArray[np.uint8]) -
 def consecutive_runs(batch: DatagramBatch) -> Iterator[tuple[int, memoryview]]:
     """The batch cut into runs (count, bytes) of equal-sized datagrams whose headers continue the first one's.
 
-    Anything that is no fragment, and the shorter last datagram, is a run of its own.
+    Anything that is no fragment, the shorter last datagram, and each of a few datagrams is a run of its own.
     """
     full = len(batch.buffer) // batch.segment_size
-    if full > 1 and batch.segment_size > FRAGMENT_HEADER_SIZE:
+    if full >= _WORTH_COMPARING and batch.segment_size > FRAGMENT_HEADER_SIZE:
         strides = (batch.segment_size, 8)
         words = np.ndarray((full, _WORDS), "<u8", batch.buffer, strides=strides)
         follows = (words[1:] - words[:-1] == _NEXT_FRAGMENT).all(axis=1)

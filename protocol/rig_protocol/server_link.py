@@ -111,6 +111,9 @@ class ServerLink:
 
     def receive_batch(self, batch: DatagramBatch, address: Address, now_ns: int) -> None:
         """Take datagrams of one sender; the buffer may be reused after the call."""
+        if len(batch.buffer) <= batch.segment_size:
+            self._receive(batch.buffer, address, now_ns)
+            return
         for count, run in consecutive_runs(batch):
             if run[:4] == FRAGMENT_PREFIX:
                 self._receive_fragments(run, count, address, now_ns)

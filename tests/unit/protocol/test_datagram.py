@@ -95,9 +95,9 @@ def test_a_run_ends_at_a_gap_a_repetition_and_a_step_back() -> None:
 
 
 def test_the_shorter_last_datagram_is_a_run_of_its_own() -> None:
-    tail = datagram.pack_fragment_header(following(4)[-1]) + b"end"
-    runs = list(consecutive_runs(batch_of(following(3), tail=tail)))
-    assert [count for count, _ in runs] == [3, 1]
+    tail = datagram.pack_fragment_header(following(6)[-1]) + b"end"
+    runs = list(consecutive_runs(batch_of(following(5), tail=tail)))
+    assert [count for count, _ in runs] == [5, 1]
     assert bytes(runs[1][1]) == tail
 
 
@@ -107,6 +107,10 @@ def test_the_runs_of_any_batch_are_its_bytes_in_order(size: int) -> None:
     runs = list(consecutive_runs(DatagramBatch(content, size)))
     assert b"".join(bytes(run) for _, run in runs) == content
     assert sum(count for count, _ in runs) == len(DatagramBatch(content, size))
+
+
+def test_a_few_datagrams_are_runs_of_one() -> None:
+    assert [count for count, _ in consecutive_runs(batch_of(following(3)))] == [1, 1, 1]
 
 
 def test_an_empty_batch_has_no_runs() -> None:
