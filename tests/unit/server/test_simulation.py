@@ -68,9 +68,10 @@ def test_closing_ends_every_agent_and_is_harmless_twice() -> None:
 
 
 @pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGTERM])
-def test_no_agent_outlives_a_server_that_dies(number: signal.Signals) -> None:
+def test_no_agent_outlives_a_server_that_dies(number: signal.Signals, tmp_path: Path) -> None:
+    environment = os.environ | {"TMPDIR": str(tmp_path)}  # its files do outlive it
     with subprocess.Popen(
-        [sys.executable, "-c", START_AND_TELL], stdout=subprocess.PIPE, text=True
+        [sys.executable, "-c", START_AND_TELL], stdout=subprocess.PIPE, text=True, env=environment
     ) as server:
         assert server.stdout is not None
         pids = [int(word) for word in server.stdout.readline().split()]
