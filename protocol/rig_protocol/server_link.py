@@ -111,7 +111,7 @@ class ServerLink:
 
     def receive_batch(self, batch: DatagramBatch, address: Address, now_ns: int) -> None:
         """Take datagrams of one sender; the buffer may be reused after the call."""
-        if len(batch.buffer) <= batch.segment_size:
+        if 0 < len(batch.buffer) <= batch.segment_size:
             self._receive(batch.buffer, address, now_ns)
             return
         for count, run in consecutive_runs(batch):
