@@ -4,7 +4,6 @@ Linux hands over several datagrams of one sender in one call (UDP_GRO). Where it
 one datagram, and what waits of one sender is gathered here: the link gets batches either way.
 """
 
-import errno
 import logging
 import select
 import socket
@@ -15,16 +14,15 @@ from collections.abc import Callable, Iterable
 from typing import Protocol
 
 from rig_protocol.datagram import DatagramBatch
-from rig_protocol.errors import ConfigurationError, RigError
 from rig_protocol.events import Address, ServerEvent
 from rig_server.gatherer import Gatherer
+from rig_server.udp_socket import ask_for_receive_buffer, bound_udp_socket, switch_on
 
 logger = logging.getLogger(__name__)
 
 # <linux/udp.h>, <asm-generic/socket.h>: Python names none of them.
 _UDP_GRO = 104
 _SO_RXQ_OVFL = 40
-_SO_RCVBUFFORCE = 33
 
 _MAX_RECEIVE = 65_536  # what one recvmsg returns at most, merged or not
 _ANCILLARY_SIZE = 2 * socket.CMSG_SPACE(4)  # the segment size and the drop counter
@@ -81,10 +79,10 @@ class Receiver:
     ) -> None:
         self._link = link
         self._on_event = on_event
-        self._socket = _bound_socket(address)
-        self.receive_buffer_bytes = _ask_for_buffer(self._socket, receive_buffer_bytes)
-        self.merges = use_gro and _switch_on(self._socket, socket.IPPROTO_UDP, _UDP_GRO)
-        self.counts_drops = _switch_on(self._socket, socket.SOL_SOCKET, _SO_RXQ_OVFL)
+        self._socket = bound_udp_socket(address)
+        self.receive_buffer_bytes = ask_for_receive_buffer(self._socket, receive_buffer_bytes)
+        self.merges = use_gro and switch_on(self._socket, socket.IPPROTO_UDP, _UDP_GRO)
+        self.counts_drops = switch_on(self._socket, socket.SOL_SOCKET, _SO_RXQ_OVFL)
         self.kernel_drops = 0  # datagrams that found the socket's buffer full
         self.unsent = 0  # control datagrams that the network refused
         self.failure: Exception | None = None
@@ -183,64 +181,6 @@ class Receiver:
             except OSError as error:  # the route to one agent is no reason to stop for the others
                 self.unsent += 1
                 logger.debug("control datagram to %s was not sent: %s", address, error)
-
-
-def _bound_socket(address: Address) -> socket.socket:
-    host, port = address
-    try:
-        family, kind, protocol, _, where = socket.getaddrinfo(
-            host, port, type=socket.SOCK_DGRAM, flags=socket.AI_PASSIVE
-        )[0]
-    except socket.gaierror as error:
-        raise ConfigurationError(f"listen address {host!r} is not known: {error.strerror}") from error
-    bound = socket.socket(family, kind | socket.SOCK_NONBLOCK, protocol)
-    try:
-        bound.bind(where)
-    except OSError as error:
-        bound.close()
-        raise _bind_error(error, host, port) from error
-    return bound
-
-
-def _bind_error(error: OSError, host: str, port: int) -> RigError:
-    if error.errno == errno.EADDRINUSE:
-        return RigError(
-            f"UDP port {port} is in use: stop the other rig-server "
-            f"(`systemctl stop rig-server`, `ss -ulpn sport = :{port}`) or choose another with --listen"
-        )
-    if error.errno == errno.EADDRNOTAVAIL:
-        return ConfigurationError(f"no interface of this machine has address {host}: see `ip addr`")
-    return ConfigurationError(f"cannot listen on {host}:{port}: {error.strerror}")
-
-
-def _ask_for_buffer(bound: socket.socket, wanted: int) -> int:
-    """Ask for a receive buffer; the size that the kernel granted, with a warning when it is smaller."""
-    bound.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, wanted)
-    if _granted(bound) < wanted:
-        try:
-            bound.setsockopt(socket.SOL_SOCKET, _SO_RCVBUFFORCE, wanted)  # with CAP_NET_ADMIN
-        except OSError:
-            logger.warning(
-                "the kernel grants a receive buffer of %d KiB instead of %d KiB; bursts may lose datagrams: "
-                "sudo sysctl -w net.core.rmem_max=%d",
-                _granted(bound) // 1024,
-                wanted // 1024,
-                wanted,
-            )
-    return _granted(bound)
-
-
-def _granted(bound: socket.socket) -> int:
-    """The kernel doubles what was asked for to hold its own book-keeping, and reports the double."""
-    return bound.getsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF) // 2
-
-
-def _switch_on(bound: socket.socket, level: int, option: int) -> bool:
-    try:
-        bound.setsockopt(level, option, 1)
-    except OSError:
-        return False
-    return True
 
 
 def _leading_int(data: bytes) -> int:

@@ -228,7 +228,7 @@ def test_an_address_that_is_not_ours_is_a_configuration_error(host: str) -> None
 def test_a_receive_buffer_that_the_kernel_refuses_names_the_sysctl(
     monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    monkeypatch.setattr("rig_server.receiver._SO_RCVBUFFORCE", 0xFFFF)  # as without CAP_NET_ADMIN
+    monkeypatch.setattr("rig_server.udp_socket._SO_RCVBUFFORCE", 0xFFFF)  # as without CAP_NET_ADMIN
     wanted = 1 << 30
     with caplog.at_level(logging.WARNING):
         receiver = Receiver(EchoLink(), LOOPBACK, print, wanted)
