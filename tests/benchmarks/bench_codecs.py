@@ -168,9 +168,9 @@ the others are the 12 views of `tum_fr1_rpy_12views`. Bayer images are re-mosaic
 {table}
 
 By default an agent sends Bayer and disparity, both lossless: {pair_kib:.0f} KiB a frame, encoded in
-{results["pair_encode_ms"]:.1f} ms and decoded in {results["pair_decode_ms"]:.2f} ms of one core. Twelve cameras
-at 30 frames a second are {pair_kib * 1024 * 360 / 1e6:.0f} MB/s of payload. The server's decoder takes
-{one:.0f} such pairs a second on one thread and {two:.0f} on two; the rig needs 360."""
+{results["pair_encode_ms"]:.1f} ms and decoded in {results["pair_decode_ms"]:.2f} ms of one core.
+Twelve cameras at 30 frames a second are {pair_kib * 1024 * 360 / 1e6:.0f} MB/s of payload. The server's
+decoder takes {one:.0f} such pairs a second on one thread and {two:.0f} on two; the rig needs 360."""
 
 
 def main() -> None:

@@ -24,10 +24,10 @@ I16 = npt.NDArray[np.int16]
 I64 = npt.NDArray[np.int64]
 Rows = tuple[I16, I16, I16, I16]
 
+# Constants are compiled in, and the cache looks at this file alone: touch it when `pyramid` changes.
 _LIMIT_1, _LIMIT_2, _LIMIT_3 = CONTEXT_LIMITS
 _CENTRES, _COLUMNS, _ROWS = range(3)
 _ESCAPED = 0xFFFE
-
 
 _STREAM = types.Array(uint8, 1, "C", readonly=True)
 _STREAM_IMAGE = types.Array(uint8, 2, "C", readonly=True)
@@ -40,7 +40,7 @@ def _compiled(signature: object) -> Callable[[Callable[P, R]], Callable[P, R]]:
     def compile_function(function: Callable[P, R]) -> Callable[P, R]:
         try:
             compiled: Callable[P, R] = numba.njit(signature, nogil=True, cache=True)(function)
-        except RuntimeError:  # neither the installation nor the user's cache folder is writable
+        except (RuntimeError, OSError):  # neither the installation nor the user's cache folder takes it
             compiled = numba.njit(signature, nogil=True)(function)
         return compiled
 
