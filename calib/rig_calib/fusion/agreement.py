@@ -5,7 +5,9 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 import numpy.typing as npt
 
-from rig_calib.fusion.surface import Array32, Surface, in_field, sample_image
+from rig_calib.fusion.sampling import sample_image
+from rig_calib.fusion.surface import Array32, Surface
+from rig_calib.fusion.visibility import in_field
 from rig_calib.projection import inside, project
 from rig_protocol.camera import Intrinsics
 from rig_protocol.poses import Pose, inverse, transform_points

@@ -8,17 +8,10 @@ import numpy.typing as npt
 
 from rig_calib.fusion.cylinder import Cylinder, complete, fill_small_holes, fit_cylinder, splat_distance
 from rig_calib.fusion.gains import NO_GAIN, Gain, color_gains
-from rig_calib.fusion.surface import (
-    Array32,
-    DepthBuffer,
-    Surface,
-    camera_surfaces,
-    frames_of,
-    in_field,
-    mean_color,
-    sample_colors,
-)
+from rig_calib.fusion.sampling import mean_color, sample_colors
+from rig_calib.fusion.surface import Array32, Surface, camera_surfaces, frames_of
 from rig_calib.fusion.viewpoint import rig_viewpoint
+from rig_calib.fusion.visibility import DepthBuffer, in_field
 from rig_calib.projection import inside, project
 from rig_calib.rig_calibration import RigCalibration
 from rig_calib.view import CameraView

@@ -7,10 +7,11 @@ import pytest
 
 from rig_calib.depth_model import DepthCorrection, depth_grid, disparity_image
 from rig_calib.fusion.agreement import overlap_differences_m
+from rig_calib.fusion.cleaning import cos_incidence, mean_disparity
 from rig_calib.fusion.fused import fuse_rig
 from rig_calib.fusion.gains import color_gains
 from rig_calib.fusion.point_cloud import fuse_point_cloud, fuse_surfaces
-from rig_calib.fusion.surface import Surface, camera_surface, camera_surfaces, cos_incidence, mean_disparity
+from rig_calib.fusion.surface import Surface, camera_surface, camera_surfaces
 from rig_calib.rig_calibration import RigCalibration
 from rig_calib.view import CameraView, views_from_panoramas
 from rig_protocol.frames import PanoramicFrame
@@ -86,6 +87,15 @@ def test_cameras_without_pose_or_depth_are_left_out_and_named() -> None:
     assert [sentence.split(":")[0] for sentence in cloud.skipped] == ["cam03", "cam05"]
     assert "no colour with depth" in cloud.skipped[0]
     assert "could not place" in cloud.skipped[1]
+
+
+def test_a_camera_whose_depth_cannot_be_placed_is_left_out_with_what_to_do() -> None:
+    views = room_views(POSES)
+    views[2] = replace(views[2], depth_frame="depth")  # but its model knows no depth camera
+    cloud = fuse_point_cloud(views, calibration_of(POSES))
+    assert len(cloud.skipped) == 1
+    assert "cam02: left out" in cloud.skipped[0]
+    assert "T_color_depth" in cloud.skipped[0]
 
 
 def test_nothing_to_fuse_gives_an_empty_cloud_and_no_panorama() -> None:
