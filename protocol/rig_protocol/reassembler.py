@@ -20,7 +20,6 @@ NUMBER_WINDOW = 32
 # A paced frame takes up to one frame interval; the rest is the network's.
 GRACE_NS = 200_000_000
 
-
 # A verified number moves the window; until one comes, losses are remembered for as many frames: 34 s.
 _MAX_FATES = 1024
 # Late fragments follow soon after their unit was given up.
@@ -101,6 +100,14 @@ class Reassembler:
             key, unit = next(iter(self._open.items()))
             if unit.deadline_ns > now_ns:
                 return
+            self._counters.incomplete += 1
+            self._give_up(key)
+
+    def close(self) -> None:
+        """The session is over: what is not whole, or was never seen below a delivered number, is lost."""
+        delivered = [number for number, whole in self._fates.items() if whole]
+        self._move_window(max(delivered, default=-1) + 1)
+        for key in list(self._open):
             self._counters.incomplete += 1
             self._give_up(key)
 

@@ -277,7 +277,7 @@ class ServerLink:
 
     def _end(self, session: ServerSession, text: str) -> None:
         del self._sessions[session.welcome.session_id]
-        session.status.connected = False
+        session.close()
         self._push(CameraLeft(session.welcome.camera_id, text))
 
     def _answer_copy(self, holder: ServerSession | None, nonce: int, address: Address) -> None:

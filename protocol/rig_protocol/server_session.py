@@ -80,6 +80,11 @@ class ServerSession:
         """Give up the frames whose time is over."""
         self._reassembler.expire(now_ns)
 
+    def close(self) -> None:
+        """The session is over: count what it leaves unfinished."""
+        self._reassembler.close()
+        self.status.connected = False
+
     @property
     def next_timeout_ns(self) -> int:
         """When the session has something to do next."""

@@ -200,6 +200,18 @@ def test_a_lost_frame_is_counted_once_whatever_the_cause() -> None:
     assert (bench.counters.incomplete, bench.counters.missing, bench.counters.corrupt) == (1, 1, 1)
 
 
+def test_at_the_end_of_a_session_what_is_open_or_was_skipped_is_counted_as_lost() -> None:
+    bench = Bench().feed(datagrams(0)).feed(datagrams(5)).feed(datagrams(3)[:1]).feed(datagrams(6)[:2])
+    bench.reassembler.close()
+    assert (bench.counters.incomplete, bench.counters.missing) == (2, 3)
+
+
+def test_a_session_without_frames_ends_without_loss() -> None:
+    bench = Bench()
+    bench.reassembler.close()
+    assert bench.counted() == {}
+
+
 def test_only_a_verified_frame_moves_the_window() -> None:
     far_ahead = with_header(datagrams(0)[0], frame_number=2**60)
     bench = Bench().feed([far_ahead]).feed(datagrams(0))

@@ -91,6 +91,7 @@ def test_twelve_agents_on_a_rough_network_deliver_only_true_frames_and_count_the
         agent.make_frame = None
     network.run(1.0)
     assert network.server is not None
+    network.server.close(network.now_ns)
     assert_delivered_frames_are_true(network)
     lost: Counter[str] = Counter()
     for camera_id, frames in frames_of(network).items():
@@ -99,8 +100,8 @@ def test_twelve_agents_on_a_rough_network_deliver_only_true_frames_and_count_the
         assert len(frames) == counters.frames
         assert counters.frames >= 0.75 * sent
         # A bit error in a header can open a unit that was never sent: the sum may exceed what was sent.
-        # It falls short only by the numbers that the window has not passed yet.
-        assert sent - 3 <= counters.frames + counters.lost <= sent + agent.uplink.done["corrupted"]
+        # It falls short only where the very last frame left no trace.
+        assert sent - 1 <= counters.frames + counters.lost <= sent + agent.uplink.done["corrupted"]
         lost.update({name: getattr(counters, name) for name in ("incomplete", "duplicate")})
     assert all(lost[name] > 0 for name in lost)
 
@@ -111,9 +112,8 @@ def test_stamps_are_in_rig_time_within_their_uncertainty() -> None:
     errors = [error for camera_id in range(4) for error in clock_errors(network, camera_id)]
     assert len(errors) > 600
     assert max(abs(error_ns) for error_ns, _ in errors) < 2_000_000
-    assert sum(abs(error_ns) <= 2 * uncertainty_ns for error_ns, uncertainty_ns in errors) > 0.95 * len(
-        errors
-    )
+    within = [abs(error_ns) <= 2 * uncertainty_ns for error_ns, uncertainty_ns in errors]
+    assert sum(within) > 0.95 * len(within)
 
 
 def clock_errors(network: VirtualNetwork, camera_id: int) -> list[tuple[int, int]]:
