@@ -29,7 +29,7 @@ _log = logging.getLogger(__name__)
 
 _QUEUE_FRAMES = 2  # covers one hiccup of the next stage; older frames are stale
 _GAUGES_INTERVAL_NS = 1_000_000_000
-_TICK_S = 0.5  # how soon a thread notices that it should end
+_TICK_S = 0.2  # how soon a thread notices that it should end
 _HUNG_NS = 60_000_000_000  # a driver call that takes longer will not return
 _STOP_TIMEOUT_S = 5.0  # closing a Kinect takes a few seconds at most
 

@@ -18,6 +18,8 @@ CONFIG_PLACES = (Path("agent.toml"), Path("/etc/kinect-rig/agent.toml"))
 DEFAULT_PORT = 7400
 
 SourceName = Literal["freenect", "folder", "synthetic"]
+Manner = Literal["lossless", "jpeg", "raw"]
+"""How images travel: losslessly compressed, as JPEG, uncompressed."""
 
 
 class FolderSettings(Settings):
@@ -51,13 +53,13 @@ class AgentSettings(Settings):
     """Name that the operator sees; unset: cam00, cam01, ... after the slot, else this machine's name."""
     fps: float | None = Field(None, ge=0.1, le=120, examples=[30.0])
     """Frames a second to send; unset: as many as the source delivers (a folder: 30)."""
-    color: Literal["lossless", "jpeg", "raw"] = "lossless"
+    color: Manner = "lossless"
     """How colour travels: losslessly compressed, as JPEG, or uncompressed. The server may refuse JPEG."""
     depth: Literal["lossless", "raw"] = "lossless"
     """How depth travels: losslessly compressed or uncompressed."""
     datagram_size: int = Field(DEFAULT_DATAGRAM_SIZE, ge=MIN_DATAGRAM_SIZE, le=MAX_DATAGRAM_SIZE)
     """Largest UDP payload in bytes: the path's MTU minus 28 (jumbo frames: 8972)."""
-    report_interval_s: float = Field(10.0, ge=1, le=3600)
+    report_interval_s: float = Field(60.0, ge=1, le=3600)
     """How often one line in the log tells rates, drops and reconnects."""
     log_level: Literal["DEBUG", "INFO", "WARNING", "ERROR"] = "INFO"
     """What is worth a line in the log."""

@@ -1,15 +1,12 @@
 """What the agent says about itself and its camera when it asks to join the rig."""
 
 from importlib.metadata import version
-from typing import Literal
 
-from rig_agent.config import AgentSettings
+from rig_agent.config import AgentSettings, Manner
 from rig_agent.sources.base import SourceDescription
 from rig_protocol.codecs import Codec, ImageKind, codec, codecs_for
 from rig_protocol.codecs.raw import UncompressedCodec
 from rig_protocol.messages import Hello
-
-Manner = Literal["lossless", "jpeg", "raw"]
 
 # The manners that an agent offers, best first. Nothing is sent lossy that the operator wanted lossless.
 _OFFERS: dict[Manner, tuple[Manner, ...]] = {
