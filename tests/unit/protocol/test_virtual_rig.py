@@ -100,8 +100,12 @@ def test_twelve_agents_on_a_rough_network_deliver_only_true_frames_and_count_the
         assert len(frames) == counters.frames
         assert counters.frames >= 0.75 * sent
         # A bit error in a header can open a unit that was never sent: the sum may exceed what was sent.
-        # It falls short only where the very last frame left no trace.
-        assert sent - 1 <= counters.frames + counters.lost <= sent + agent.uplink.done["corrupted"]
+        # It falls short only by the frames of a burst at the very end, which left no trace.
+        assert (
+            sent - 1 - ROUGH.burst_length // 3
+            <= counters.frames + counters.lost
+            <= sent + agent.uplink.done["corrupted"]
+        )
         lost.update({name: getattr(counters, name) for name in ("incomplete", "duplicate")})
     assert all(lost[name] > 0 for name in lost)
 
