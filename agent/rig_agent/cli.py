@@ -10,7 +10,6 @@ from rig_protocol.errors import ConfigurationError
 from rig_protocol.programs import run_program, set_up_logging
 
 if TYPE_CHECKING:  # heavy: imported where they are used, so that --help is quick
-    from rig_agent.agent import Agent
     from rig_agent.config import AgentSettings
 
 _EXAMPLES = """
@@ -75,6 +74,7 @@ def run(
     """
     if context.invoked_subcommand is not None:
         return
+    _on_signals(_leave)  # until the agent runs there is nothing to end in order
     from rig_agent.config import load_agent_settings
     from rig_protocol.settings_docs import effective_toml
 
@@ -131,10 +131,22 @@ def _stream(settings: "AgentSettings") -> None:
     from rig_agent.sources import open_source
 
     agent = Agent(settings, lambda: open_source(settings))
-    # The second Ctrl-C falls back to the usual way: an end without ceremony.
-    for number in (signal.SIGTERM, signal.SIGINT):
-        signal.signal(number, lambda *_: _stop_once(agent))
+
+    def stop(*_: object) -> None:
+        _on_signals(signal.SIG_DFL)  # a second Ctrl-C ends the program without ceremony
+        agent.stop()
+
+    _on_signals(stop)
     agent.run()
+
+
+def _on_signals(action: Any) -> None:
+    for number in (signal.SIGTERM, signal.SIGINT):
+        signal.signal(number, action)
+
+
+def _leave(*_: object) -> None:
+    raise SystemExit(0)
 
 
 def _write_truth(path: Path, settings: "AgentSettings") -> None:
@@ -145,12 +157,6 @@ def _write_truth(path: Path, settings: "AgentSettings") -> None:
         write_true_poses(path, true_poses(settings.synthetic))
     except OSError as error:
         raise ConfigurationError(f"{path} cannot be written: {error.strerror}") from error
-
-
-def _stop_once(agent: "Agent") -> None:
-    for number in (signal.SIGTERM, signal.SIGINT):
-        signal.signal(number, signal.SIG_DFL)
-    agent.stop()
 
 
 def _slot_or_name(camera: str | None) -> tuple[int | None, str | None]:

@@ -17,6 +17,7 @@ from rig_protocol.errors import ConfigurationError
 def _nowhere(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr("rig_agent.config.CONFIG_PLACES", (Path("agent.toml"),))
+    monkeypatch.setattr(cli, "_on_signals", lambda _action: None)  # the signals are pytest's
 
 
 @pytest.fixture
