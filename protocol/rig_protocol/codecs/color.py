@@ -4,7 +4,6 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Literal
 
-import cv2
 import numpy as np
 
 from rig_protocol.codecs import pyramid
@@ -46,13 +45,12 @@ class BayerCodec:
         height, width, body = unpack_header(data)
         rows, columns = pyramid.padded_shape(height, width, 2 * BLOCK)
         residuals = _Residuals(body, rows * columns)
-        green = residuals.plane(np.zeros((rows // 2, columns // 2), np.int16))
-        other_green, at_red, at_blue = residuals.greens(green)
-        red, blue = residuals.plane(at_red) + at_red, residuals.plane(at_blue) + at_blue
-        residuals.check_spent()
         mosaic = np.empty((rows, columns), np.uint8)
-        mosaic[0::2] = _alternate(green, red)
-        mosaic[1::2] = _alternate(blue, other_green)
+        residuals.plane(np.zeros((rows // 2, columns // 2), np.int16), mosaic[0::2, 0::2])
+        green_at_red, green_at_blue = residuals.greens(mosaic)
+        residuals.plane(green_at_red, mosaic[0::2, 1::2])
+        residuals.plane(green_at_blue, mosaic[1::2, 0::2])
+        residuals.check_spent()
         return np.ascontiguousarray(mosaic[:height, :width])
 
 
@@ -76,9 +74,10 @@ class GreyCodec:
         height, width, body = unpack_header(data)
         rows, columns = pyramid.padded_shape(height, width, BLOCK)
         residuals = _Residuals(body, rows * columns)
-        plane = residuals.plane(np.zeros((rows, columns), np.int16))
+        image = np.empty((rows, columns), np.uint8)
+        residuals.plane(np.zeros((rows, columns), np.int16), image)
         residuals.check_spent()
-        return plane[:height, :width].astype(np.uint8)
+        return np.ascontiguousarray(image[:height, :width])
 
 
 @dataclass(frozen=True, slots=True)
@@ -100,10 +99,13 @@ class BgrCodec:
         height, width, body = unpack_header(data)
         rows, columns = pyramid.padded_shape(height, width, BLOCK)
         residuals = _Residuals(body, 3 * rows * columns)
-        green = residuals.plane(np.zeros((rows, columns), np.int16))
-        blue, red = residuals.plane(green) + green, residuals.plane(green) + green
+        image = np.empty((rows, columns, 3), np.uint8)
+        residuals.plane(np.zeros((rows, columns), np.int16), image[..., 1])
+        green = image[..., 1].astype(np.int16)
+        residuals.plane(green, image[..., 0])
+        residuals.plane(green, image[..., 2])
         residuals.check_spent()
-        return np.stack([plane[:height, :width].astype(np.uint8) for plane in (blue, green, red)], axis=2)
+        return np.ascontiguousarray(image[:height, :width])
 
 
 def _mosaic_steps(mosaic: ImageU8) -> Iterator[Step]:
@@ -128,12 +130,6 @@ def _pack(image: ImageU8, steps: Iterator[Step]) -> bytes:
     return b"".join([pack_header(image), lengths, compress(streams, _HASH_LOG)])
 
 
-def _alternate(even: Plane, odd: Plane) -> ImageU8:
-    """Rows whose even columns come from one plane and whose odd ones from the other."""
-    pairs = cv2.merge([even.astype(np.uint8), odd.astype(np.uint8)])
-    return np.asarray(pairs, np.uint8).reshape(even.shape[0], 2 * even.shape[1])
-
-
 class _Residuals:
     """The residuals of a payload: one array, and a cursor into it for each context."""
 
@@ -146,14 +142,13 @@ class _Residuals:
         self._ends = np.cumsum(lengths)
         self.cursors = self._ends - lengths
 
-    def plane(self, reference: Plane) -> Plane:
-        """The next plane's differences to `reference`."""
-        plane: Plane = decoding_kernels().restore_plane(reference, self.symbols, self.cursors)
-        return plane
+    def plane(self, reference: Plane, pixels: ImageU8) -> None:
+        """Fill the pixels of the next plane, coded as differences to `reference`."""
+        decoding_kernels().restore_plane(reference, self.symbols, self.cursors, pixels)
 
-    def greens(self, green: Plane) -> Plane:
-        """The next step of a mosaic: its other green grid, green where red and where blue is (3, H, W)."""
-        greens: Plane = decoding_kernels().restore_greens(green, self.symbols, self.cursors)
+    def greens(self, mosaic: ImageU8) -> Plane:
+        """Fill the other green grid, a mosaic's next step; green where red and where blue is (2, H, W)."""
+        greens: Plane = decoding_kernels().restore_greens(mosaic, self.symbols, self.cursors)
         return greens
 
     def check_spent(self) -> None:

@@ -11,7 +11,7 @@ from typing import ParamSpec, TypeVar
 import numba
 import numpy as np
 import numpy.typing as npt
-from numba import int16, int64, types, uint8, uint16
+from numba import int16, int64, types, uint8, uint16, void
 
 from rig_protocol.codecs.pyramid import CONTEXT_LIMITS, LEVELS
 
@@ -87,7 +87,7 @@ def _add_residuals(prediction: I16, context: U8, reference: I16, symbols: U8, cu
 
 
 @_inlined
-def _frame_corners(plane: I16, stride: int, corners: I16) -> None:
+def _frame_corners(plane: I16 | U8, stride: int, corners: I16) -> None:
     """Every stride-th pixel, with the last row and column repeated."""
     height, width = corners.shape[0] - 1, corners.shape[1] - 1
     for y in range(height):
@@ -122,9 +122,9 @@ def _restore_coarsest(plane: I16, stride: int, reference: I16, symbols: U8, curs
             plane[y, x] = previous
 
 
-@_compiled(_I16_IMAGE(_I16_IMAGE, _STREAM, int64[::1]))
-def restore_plane(reference: I16, symbols: U8, cursors: I64) -> I16:
-    """The differences of an image to `reference`, both of whole blocks; advances `cursors`."""
+@_compiled(void(_I16_IMAGE, _STREAM, int64[::1], uint8[:, :]))
+def restore_plane(reference: I16, symbols: U8, cursors: I64, pixels: U8) -> None:
+    """Fill `pixels`, coded as differences to `reference`, of whole blocks; advances `cursors`."""
     stride = 1 << LEVELS
     rows, columns = reference.shape
     plane = np.empty((rows, columns), np.int16)
@@ -148,25 +148,31 @@ def restore_plane(reference: I16, symbols: U8, cursors: I64) -> I16:
                 for x in range(width):
                     plane[stride * y + down, stride * x + right] = row[x]
         stride = half
-    return plane
+    for y in range(rows):
+        for x in range(columns):
+            pixels[y, x] = plane[y, x] + reference[y, x]
 
 
-@_compiled(int16[:, :, ::1](_I16_IMAGE, _STREAM, int64[::1]))
-def restore_greens(green: I16, symbols: U8, cursors: I64) -> I16:
-    """The other green grid of a mosaic, green where red is and where blue is; advances `cursors`."""
-    height, width = green.shape
+@_compiled(int16[:, :, ::1](uint8[:, ::1], _STREAM, int64[::1]))
+def restore_greens(mosaic: U8, symbols: U8, cursors: I64) -> I16:
+    """Fill a mosaic's green pixels in odd rows from those in even ones; advances `cursors`.
+
+    Returns green where red and where blue is (2, H/2, W/2).
+    """
+    height, width = mosaic.shape[0] // 2, mosaic.shape[1] // 2
     corners = np.empty((height + 1, width + 1), np.int16)
     centres = np.empty((height + 1, width + 1), np.int16)
-    greens = np.empty((3, height, width), np.int16)
-    other, at_red, at_blue = greens[0], greens[1], greens[2]
-    context, zeros = np.empty(width, np.uint8), np.zeros(width, np.int16)
-    _frame_corners(green, 1, corners)
+    row, context, zeros = np.empty(width, np.int16), np.empty(width, np.uint8), np.zeros(width, np.int16)
+    greens = np.empty((2, height, width), np.int16)
+    _frame_corners(mosaic, 2, corners)
     for y in range(height):
-        _predict_row(_neighbour_rows(_CENTRES, corners, centres, y), other[y], context)
-        _add_residuals(other[y], context, zeros, symbols, cursors)
-        _frame_centres(other[y], y, centres)
-        _predict_row(_neighbour_rows(_COLUMNS, corners, centres, y), at_red[y], context)
-        _predict_row(_neighbour_rows(_ROWS, corners, centres, y), at_blue[y], context)
+        _predict_row(_neighbour_rows(_CENTRES, corners, centres, y), row, context)
+        _add_residuals(row, context, zeros, symbols, cursors)
+        _frame_centres(row, y, centres)
+        for x in range(width):
+            mosaic[2 * y + 1, 2 * x + 1] = row[x]
+        _predict_row(_neighbour_rows(_COLUMNS, corners, centres, y), greens[0, y], context)
+        _predict_row(_neighbour_rows(_ROWS, corners, centres, y), greens[1, y], context)
     return greens
 
 
