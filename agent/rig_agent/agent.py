@@ -63,7 +63,7 @@ class Agent:
             captured=capture.captured,
             sent=uplink.sent,
             dropped=self._captured.dropped + self._encoded.dropped + uplink.dropped,
-            unheard=self._unheard,
+            unheard=self._unheard + uplink.unheard,
             damaged=capture.damaged,
             connections=uplink.connections,
             source_losses=capture.losses,

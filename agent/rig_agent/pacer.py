@@ -38,11 +38,6 @@ class Pacer:
         self._due_ns = 0
         self.counters = PacerCounters()
 
-    @property
-    def idle(self) -> bool:
-        """True when every frame has been sent."""
-        return self._current is None
-
     def submit(self, batch: DatagramBatch, now_ns: int) -> None:
         """Take a frame to send; an older one that has not begun, or has become stale, is dropped."""
         if self._current is None:

@@ -99,7 +99,6 @@ class Transport:
         while self._socket is not None and len(received) < _MAX_DATAGRAMS_A_WAKE:
             try:
                 received.append(self._socket.recv(_RECEIVE_BYTES))
-                self._last_error = None
             except OSError as error:
                 if error.errno in _BUSY:
                     break
@@ -107,6 +106,10 @@ class Transport:
                 if error.errno != errno.ECONNREFUSED:
                     break
         return received
+
+    def server_reached(self) -> None:
+        """A session has begun: trouble that comes now is news, even if it is that of before."""
+        self._last_error = None
 
     def close(self) -> None:
         """Close the socket; harmless when closed."""
@@ -129,7 +132,7 @@ class Transport:
         self.counters.bytes_sent += len(data)
 
     def _note(self, error: OSError) -> None:
-        """Count an error; log it when it differs from the last one since the server was heard."""
+        """Count an error; log it when it differs from the last one since the server was reached."""
         if error.errno in _BUSY:
             return
         if error.errno == errno.ECONNREFUSED:

@@ -32,6 +32,7 @@ class Uplink:
         self._reopen_ns = 0
         self._refusal = ""
         self.connections = 0
+        self.unheard = 0
 
     @property
     def welcome(self) -> Welcome | None:
@@ -69,9 +70,11 @@ class Uplink:
         return self._transport.fileno()
 
     def send_frame(self, frame: EncodedFrame, now_ns: int) -> None:
-        """Queue a frame for sending; dropped while nobody listens."""
+        """Queue a frame for sending; dropped, and counted in `unheard`, while nobody listens."""
         batch = None if self._link is None else self._link.send_frame(frame, now_ns)
-        if batch is not None:
+        if batch is None:
+            self.unheard += 1
+        else:
             self._pacer.submit(batch, now_ns)
 
     def serve(self, now_ns: int) -> None:
@@ -122,6 +125,7 @@ class Uplink:
             case Connected(welcome):
                 self.connections += 1
                 self._refusal = ""
+                self._transport.server_reached()
                 _log.info("connected to %s as camera %d", self._server, welcome.camera_id)
             case Rejected(reason, text):
                 if text != self._refusal:

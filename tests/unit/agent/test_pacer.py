@@ -36,7 +36,7 @@ def test_every_datagram_is_sent_once_in_order() -> None:
     pacer = make_pacer()
     pacer.submit(DatagramBatch(data, SIZE), 0)
     assert b"".join(burst for _, burst in drain(pacer, 0, INTERVAL_NS)) == data
-    assert pacer.idle
+    assert pacer.next_timeout_ns() is None
     assert pacer.counters.sent == 1
 
 

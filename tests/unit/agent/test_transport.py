@@ -130,5 +130,20 @@ def test_a_network_that_is_down_is_counted_and_reported_once(
     monkeypatch.setattr(transport, "_send_once", unreachable)
     with caplog.at_level(logging.WARNING):
         assert [transport.send(batch(2)) for _ in range(3)] == [0, 0, 0]
-    assert transport.counters.network_errors == 3
-    assert len(caplog.messages) == 1
+        assert len(caplog.messages) == 1
+        transport.server_reached()
+        transport.send(batch(2))
+        assert len(caplog.messages) == 2
+    assert transport.counters.network_errors == 4
+
+
+def test_a_datagram_larger_than_the_path_allows_says_what_to_change(
+    transport: Transport, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
+) -> None:
+    def too_long(_data: memoryview, _segment_size: int | None) -> None:
+        raise OSError(errno.EMSGSIZE, "Message too long")
+
+    monkeypatch.setattr(transport, "_send_once", too_long)
+    with caplog.at_level(logging.WARNING):
+        transport.send(batch(1))
+    assert "lower `datagram_size`" in caplog.messages[0]

@@ -83,7 +83,7 @@ def test_frames_are_not_queued_while_nobody_listens() -> None:
     uplink = Uplink(SETTINGS)
     uplink.introduce(HELLO, 0)
     uplink.send_frame(EncodedFrame(0, 0, 0), 0)
-    assert (uplink.sent, uplink.dropped, uplink.welcome) == (0, 0, None)
+    assert (uplink.sent, uplink.dropped, uplink.unheard, uplink.welcome) == (0, 0, 1, None)
 
 
 def test_closing_without_a_session_is_silent(transport: DeadTransport) -> None:
