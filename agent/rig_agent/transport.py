@@ -71,13 +71,15 @@ class Transport:
 
     def send(self, batch: DatagramBatch) -> int:
         """Hand datagrams to the kernel; how many it took: not all when its buffer is full or the net down."""
+        if self._socket is None:
+            return 0  # `open` has said why
         size = batch.segment_size
         at_once = min(_MAX_SEGMENTS, max(1, _MAX_SEND_BYTES // size)) if self._segmentation else 1
         done = 0
         while done < len(batch):
             stop = min(done + at_once, len(batch))
             try:
-                self._send_once(batch.part(done, stop), size if stop - done > 1 else None)
+                self._send_once(self._socket, batch.part(done, stop), size if stop - done > 1 else None)
             except OSError as error:
                 if at_once > 1 and error.errno in _NO_SEGMENTATION:
                     _log.info("UDP segmentation offload is not available (%s): sending one by one", error)
@@ -117,18 +119,16 @@ class Transport:
             self._socket.close()
             self._socket = None
 
-    def _send_once(self, data: memoryview, segment_size: int | None) -> None:
-        if self._socket is None:
-            raise OSError(errno.ENETDOWN, "not connected")
+    def _send_once(self, to: socket.socket, data: memoryview, segment_size: int | None) -> None:
         control = []
         if segment_size is not None:
             control = [(_SOL_UDP, _UDP_SEGMENT, struct.pack("=H", segment_size))]
         try:
-            self._socket.sendmsg([data], control)
+            to.sendmsg([data], control)
         except ConnectionRefusedError:
             # The ICMP answer to an earlier datagram is reported once, here, instead of sending this one.
             self.counters.refused += 1
-            self._socket.sendmsg([data], control)
+            to.sendmsg([data], control)
         self.counters.bytes_sent += len(data)
 
     def _note(self, error: OSError) -> None:

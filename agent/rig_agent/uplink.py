@@ -16,6 +16,7 @@ _log = logging.getLogger(__name__)
 
 # How often the name of a server that does not answer is looked up again: its address may have changed.
 _REOPEN_NS = 5_000_000_000
+_NO_NETWORK_RETRY_NS = 1_000_000_000
 _ONE_FRAME_NS = 33_333_333
 
 
@@ -89,8 +90,7 @@ class Uplink:
         while (event := self._link.next_event()) is not None:
             self._report(event)
         if not self._link.connected and now_ns >= self._reopen_ns:
-            self._reopen_ns = now_ns + _REOPEN_NS
-            self._transport.open()
+            self._reopen_ns = now_ns + (_REOPEN_NS if self._transport.open() else _NO_NETWORK_RETRY_NS)
         for datagram in self._link.datagrams_to_send(now_ns):
             self._transport.send_datagram(datagram)
         burst = self._pacer.next_burst(now_ns)

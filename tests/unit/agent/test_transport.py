@@ -52,10 +52,10 @@ def test_a_kernel_without_segmentation_gets_single_datagrams(
 ) -> None:
     send_once = transport._send_once
 
-    def refuse_segments(data: memoryview, segment_size: int | None) -> None:
+    def refuse_segments(to: socket.socket, data: memoryview, segment_size: int | None) -> None:
         if segment_size is not None:
             raise OSError(refusal, "no such option")
-        send_once(data, segment_size)
+        send_once(to, data, segment_size)
 
     monkeypatch.setattr(transport, "_send_once", refuse_segments)
     assert transport.send(batch(10)) == 10
@@ -68,7 +68,7 @@ def test_a_full_kernel_buffer_takes_a_part_and_is_no_error(
     transport._segmentation = False
     room = iter(range(3))
 
-    def full_after_three(_data: memoryview, _segment_size: int | None) -> None:
+    def full_after_three(_socket: socket.socket, _data: memoryview, _size: int | None) -> None:
         if next(room, None) is None:
             raise BlockingIOError(errno.EAGAIN, "again")
 
@@ -118,13 +118,14 @@ def test_a_name_that_does_not_resolve_is_logged_once(
         assert [transport.open() for _ in range(3)] == [False] * 3
     assert caplog.messages == ["cannot reach rig-server.invalid:7400: Name or service not known; trying on"]
     assert transport.fileno() is None
+    assert transport.send(batch(3)) == 0
 
 
 def test_a_network_that_is_down_is_counted_and_reported_once(
     transport: Transport, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
 
-    def unreachable(_data: memoryview, _segment_size: int | None) -> None:
+    def unreachable(_socket: socket.socket, _data: memoryview, _size: int | None) -> None:
         raise OSError(errno.ENETUNREACH, "Network is unreachable")
 
     monkeypatch.setattr(transport, "_send_once", unreachable)
@@ -140,7 +141,7 @@ def test_a_network_that_is_down_is_counted_and_reported_once(
 def test_a_datagram_larger_than_the_path_allows_says_what_to_change(
     transport: Transport, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
-    def too_long(_data: memoryview, _segment_size: int | None) -> None:
+    def too_long(_socket: socket.socket, _data: memoryview, _size: int | None) -> None:
         raise OSError(errno.EMSGSIZE, "Message too long")
 
     monkeypatch.setattr(transport, "_send_once", too_long)

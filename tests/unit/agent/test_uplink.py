@@ -23,11 +23,12 @@ class DeadTransport:
     def __init__(self, _server: object) -> None:
         self.counters = TransportCounters()
         self.opened = 0
+        self.network = True
         self.sent: list[bytes] = []
 
     def open(self) -> bool:
         self.opened += 1
-        return True
+        return self.network
 
     def receive(self) -> list[bytes]:
         return []
@@ -76,6 +77,14 @@ def test_an_unreachable_server_hears_hellos_and_its_name_is_looked_up_every_five
     serve_until(uplink, 21 * SECOND_NS)
     assert transport.opened == 5
     assert 20 <= len(transport.sent) <= 30
+
+
+def test_without_a_network_the_way_out_is_tried_every_second(transport: DeadTransport) -> None:
+    transport.network = False
+    uplink = Uplink(SETTINGS)
+    uplink.introduce(HELLO, 0)
+    serve_until(uplink, 10 * SECOND_NS + 1)
+    assert transport.opened == 11
 
 
 @pytest.mark.usefixtures("transport")
