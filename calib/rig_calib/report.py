@@ -23,7 +23,7 @@ from rig_calib.rig_calibration import RigCalibration
 from rig_calib.view import CameraView
 from rig_protocol.camera import Intrinsics
 from rig_protocol.frames import ImageU8
-from rig_protocol.poses import Pose
+from rig_protocol.poses import Pose, inverse
 
 _MAX_MATCH_PICTURES = 24  # 60 kB each; more edges than this are in the table only
 _PANORAMA_PX = 2200  # width of the panorama in the page
@@ -51,8 +51,8 @@ def write_report(
 ) -> None:
     """Write the page, the file whole or not at all.
 
-    `views` are those of the capture, placed or not; `poses_before` are T_rig_camera before loop closure;
-    without `fused` the page has no panorama and no clouds.
+    `views` are those of the capture, placed or not; `poses_before` are those before loop closure, in
+    any frame; without `fused` the page has no panorama and no clouds.
     """
     html = report_html(calibration, views, evidence, poses_before, fused)
     part = path.with_name(path.name + ".part")
@@ -163,7 +163,7 @@ def _loop_pictures(case: _Case) -> list[Figure]:
     limits = pictures.view_limits(case.surfaces_at(poses), poses, T_rig_view)
     stages = {"after loop closure": poses}
     if case.poses_before:
-        stages = {"before loop closure": dict(case.poses_before), **stages}
+        stages = {"before loop closure": _anchored(case.poses_before, poses), **stages}
     found = []
     for name, stage_poses in stages.items():
         surfaces = case.surfaces_at(stage_poses)
@@ -171,6 +171,15 @@ def _loop_pictures(case: _Case) -> list[Figure]:
         alt = f"Walls at camera height from above, {name}, one colour a camera"
         found.append(_figure(picture, alt, name.capitalize(), drawing=True))
     return found
+
+
+def _anchored(before: Mapping[int, Pose], after: Mapping[int, Pose]) -> dict[int, Pose]:
+    """Poses before loop closure in the frame of those after it: their first common camera stays in place."""
+    common = sorted(before.keys() & after.keys())
+    if not common:
+        return dict(before)
+    T_after_before = after[common[0]] @ inverse(before[common[0]])
+    return {camera_id: T_after_before @ T for camera_id, T in before.items()}
 
 
 def _plan(case: _Case) -> PlanView | None:

@@ -186,6 +186,15 @@ def test_matches_of_an_edge_that_failed_are_shown_too() -> None:
     assert len(PageReader(page).all("img")) == 1
 
 
+def test_poses_before_loop_closure_may_be_in_a_frame_of_their_own(fused: FusedRig) -> None:
+    T_other_rig = se3_exp(np.array([0.3, 0.2, 1.0, 4.0, 5.0, 6.0]))
+    same_elsewhere = {k: T_other_rig @ T for k, T in POSES.items()}
+    page = report_html(calibration_of(POSES), VIEWS, (), same_elsewhere, fused)
+    pictures_of_cuts = [image["src"] for image in PageReader(page).all("img") if "Walls" in str(image["alt"])]
+    assert len(pictures_of_cuts) == 2
+    assert len(set(pictures_of_cuts)) == 1
+
+
 # ---- figures
 
 
