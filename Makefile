@@ -21,6 +21,9 @@ lint: $(READY)  ## style, types, import rules
 bench-codecs: $(READY)  ## sizes and times of the codecs, into docs/performance.md
 	$(BIN)/python tests/benchmarks/bench_codecs.py
 
+docs: $(READY)  ## the pages that are made from the code
+	$(BIN)/python docs/generate_configuration.py
+
 clean:  ## everything that make built
 	rm -rf $(VENV) build
 

@@ -15,7 +15,7 @@ from rig_protocol.settings import Settings, load_settings
 
 ENVIRONMENT_PREFIX = "RIG_AGENT_"
 CONFIG_PLACES = (Path("agent.toml"), Path("/etc/kinect-rig/agent.toml"))
-DEFAULT_PORT = 7400
+DEFAULT_PORT = 4012
 
 SourceName = Literal["freenect", "folder", "synthetic"]
 Manner = Literal["lossless", "jpeg", "raw"]
@@ -43,7 +43,7 @@ class PacingSettings(Settings):
 class AgentSettings(Settings):
     """Settings of rig-agent. Remove the # before a key to change it; shown are the defaults."""
 
-    server: str = Field("127.0.0.1:7400", examples=["rig-server.local:7400"])
+    server: str = Field("127.0.0.1:4012", examples=["rig-server.local:4012"])
     """Where rig-server listens: HOST:PORT or HOST."""
     source: SourceName = "freenect"
     """Where frames come from: a Kinect, a recorded rig folder or the simulator."""

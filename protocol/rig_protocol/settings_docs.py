@@ -9,7 +9,7 @@ import types
 from collections.abc import Iterator, Mapping
 from enum import Enum
 from pathlib import Path
-from typing import Any, Literal, Union, get_args, get_origin
+from typing import Annotated, Any, Literal, Union, get_args, get_origin
 
 from pydantic import BaseModel
 from pydantic.fields import FieldInfo
@@ -187,6 +187,8 @@ def _type_text(field: FieldInfo) -> str:
 
 def _annotation_text(annotation: Any) -> str:
     origin, arguments = get_origin(annotation), get_args(annotation)
+    if origin is Annotated:
+        return _annotation_text(arguments[0])
     if origin is Literal:
         return " | ".join(_toml_value(value) for value in arguments)
     if origin in (Union, types.UnionType):

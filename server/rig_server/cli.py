@@ -18,7 +18,7 @@ _EXAMPLES = """
 
 `rig-server init` — write ./rig.toml, every option explained, then list your cameras in it
 
-`rig-server` — receive on UDP port 7400 and show the live table until Ctrl-C
+`rig-server` — receive on UDP port 4012 and show the live table until Ctrl-C
 
 `rig-server --calibrate --out calibration` — calibrate the ring that streams to this PC
 
@@ -46,7 +46,7 @@ def run(
         ),
     ] = None,
     listen: Annotated[
-        str | None, typer.Option(metavar="HOST:PORT", help="Receive here; else 0.0.0.0:7400.")
+        str | None, typer.Option(metavar="HOST:PORT", help="Receive here; else 0.0.0.0:4012.")
     ] = None,
     calibrate: Annotated[
         bool, typer.Option("--calibrate", help="Calibrate the ring on the first complete sets, then end.")

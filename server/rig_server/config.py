@@ -15,7 +15,7 @@ from rig_protocol.settings import Settings, load_settings
 
 ENVIRONMENT_PREFIX = "RIG_SERVER_"
 CONFIG_PLACES = (Path("rig.toml"), Path("/etc/kinect-rig/rig.toml"))
-DEFAULT_PORT = 7400
+DEFAULT_PORT = 4012
 MAX_CAMERAS = 64  # what one server holds in memory and one roster names; a ring has twelve
 CAMERA_NAME = r"^[A-Za-z0-9][A-Za-z0-9_.-]{0,31}$"  # it names folders and files
 
@@ -78,7 +78,7 @@ class CaptureSettings(Settings):
 class RigSettings(Settings):
     """Settings of rig-server. Write your own values over the defaults below."""
 
-    listen: str = "0.0.0.0:7400"  # agents are on other machines: all interfaces are the purpose
+    listen: str = "0.0.0.0:4012"  # agents are on other machines: all interfaces are the purpose
     """Address and UDP port to receive on."""
     expected_cameras: int | None = Field(None, ge=1, le=MAX_CAMERAS, examples=[12])
     """How many cameras to wait for when none are listed below; unset: as many as come."""
@@ -135,7 +135,7 @@ def parse_address(text: str) -> Address:
     host = host.removeprefix("[").removesuffix("]")
     if not port_text.isdecimal() or not 0 <= int(port_text) <= 65_535:
         raise ValueError(f"{text!r} is not HOST:PORT with a port from 0 to 65535")
-    return host or "0.0.0.0", int(port_text)  # noqa: S104  # an empty host means all interfaces, as in `:7400`
+    return host or "0.0.0.0", int(port_text)  # noqa: S104  # an empty host means all interfaces, as in `:4012`
 
 
 def read_intrinsics(path: Path) -> CameraModel:

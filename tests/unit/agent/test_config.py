@@ -53,7 +53,7 @@ def test_a_file_that_was_asked_for_must_exist() -> None:
             r"`source`: Input should be 'freenect', 'folder' or 'synthetic' \(got 'kinect'\)",
         ),
         ('server = "pc:http"', r"`server`: .*'pc:http' is not HOST or HOST:PORT"),
-        ('server = ":7400"', r"`server`: .*is not HOST or HOST:PORT"),
+        ('server = ":4012"', r"`server`: .*is not HOST or HOST:PORT"),
         ("camera = -1", r"`camera`: .*greater than or equal to 0 \(got -1\)"),
         ("datagram_size = 100", r"`datagram_size`: .*1200 \(got 100\)"),
         ('name = "two words"', r"`name`: .*pattern"),
@@ -68,10 +68,10 @@ def test_a_mistake_is_named_with_the_nearest_key(toml: str, message: str) -> Non
 @pytest.mark.parametrize(
     ("text", "address"),
     [
-        ("pc", ("pc", 7400)),
+        ("pc", ("pc", 4012)),
         ("10.0.0.1:99", ("10.0.0.1", 99)),
         ("[fe80::1]:99", ("fe80::1", 99)),
-        ("[::1]", ("::1", 7400)),
+        ("[::1]", ("::1", 4012)),
     ],
 )
 def test_the_server_is_a_host_with_or_without_port(text: str, address: tuple[str, int]) -> None:

@@ -113,10 +113,10 @@ def test_a_name_that_does_not_resolve_is_logged_once(
         raise socket.gaierror(socket.EAI_NONAME, "Name or service not known")
 
     monkeypatch.setattr(socket, "getaddrinfo", unknown)
-    transport = Transport(("rig-server.invalid", 7400))
+    transport = Transport(("rig-server.invalid", 4012))
     with caplog.at_level(logging.WARNING):
         assert [transport.open() for _ in range(3)] == [False] * 3
-    assert caplog.messages == ["cannot reach rig-server.invalid:7400: Name or service not known; trying on"]
+    assert caplog.messages == ["cannot reach rig-server.invalid:4012: Name or service not known; trying on"]
     assert transport.fileno() is None
     assert transport.send(batch(3)) == 0
 

@@ -14,7 +14,7 @@ class Depth(Settings):
 
 
 class Program(Settings):
-    server: str = "localhost:7400"
+    server: str = "localhost:4012"
     fps: float = Field(30.0, gt=0)
     depth: Depth = Depth()
 

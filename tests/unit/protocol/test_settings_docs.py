@@ -32,7 +32,7 @@ class Program(Settings):
     """The depth stream."""
     cameras: tuple[Camera, ...] = ()
     """The ring, one table a camera."""
-    server: str = "localhost:7400"
+    server: str = "localhost:4012"
     """Where the server listens:
     a name or an address."""
     fps: float = Field(30.0, gt=0, le=60)

@@ -76,7 +76,7 @@ def test_rig_toml_of_the_working_directory_is_found(written: Path, monkeypatch: 
 @pytest.mark.parametrize(
     ("text", "told"),
     [
-        ("lisen = ':7400'", "did you mean `listen`"),
+        ("lisen = ':4012'", "did you mean `listen`"),
         ("[ring]\nradius = 0.2", "did you mean `radius_m`"),
         ("listen = 'somewhere:99999'", "port from 0 to 65535"),
         ("[[cameras]]\nid = 1\n[[cameras]]\nid = 1", "two cameras share id 1"),
@@ -101,7 +101,7 @@ def test_a_wrong_setting_is_refused_by_name(tmp_path: Path, text: str, told: str
     ("text", "address"),
     [
         ("10.0.0.1:7000", ("10.0.0.1", 7000)),
-        ("10.0.0.1", ("10.0.0.1", 7400)),
+        ("10.0.0.1", ("10.0.0.1", 4012)),
         (":7000", ("0.0.0.0", 7000)),  # noqa: S104  # what an empty host means
         ("[::1]:7000", ("::1", 7000)),
     ],
