@@ -75,15 +75,28 @@ def _predict_row(rows: Rows, prediction: I16, context: U8) -> None:
 
 
 @_inlined
-def _add_residuals(prediction: I16, context: U8, reference: I16, symbols: U8, cursors: I64) -> None:
+def _take_residuals(context: U8, symbols: U8, cursors: I64, residual: U8) -> None:
+    """A row's residuals, each from the stream of its context; advances `cursors`.
+
+    What the row takes from the four streams is counted in one register, 16 bits each: through memory
+    every pixel would wait some cycles for the count of the one before.
+    """
+    last, sixteen, low = symbols.size - 1, np.uint64(16), np.uint64(0xFFFF)
+    taken = np.uint64(0)
+    for x in range(context.size):
+        shift = np.uint64(context[x]) * sixteen
+        cursor = cursors[context[x]] + np.int64((taken >> shift) & low)
+        residual[x] = symbols[min(cursor, last)]
+        taken += np.uint64(1) << shift
+    for stream in range(cursors.size):
+        cursors[stream] += np.int64((taken >> (np.uint64(stream) * sixteen)) & low)
+
+
+@_inlined
+def _add_residuals(prediction: I16, residual: U8, reference: I16) -> None:
     """Turn a row's predictions into its differences to `reference`; their sum with it is 0–255."""
-    last = symbols.size - 1
-    for x in range(context.size):
-        cursor = cursors[context[x]]
-        prediction[x] += symbols[min(cursor, last)]
-        cursors[context[x]] = cursor + 1
-    for x in range(context.size):
-        prediction[x] = ((prediction[x] + reference[x]) & 255) - reference[x]
+    for x in range(residual.size):
+        prediction[x] = ((prediction[x] + residual[x] + reference[x]) & 255) - reference[x]
 
 
 @_inlined
@@ -133,7 +146,8 @@ def restore_plane(reference: I16, symbols: U8, cursors: I64, pixels: U8) -> None
         height, width, half = rows // stride, columns // stride, stride // 2
         corners = np.empty((height + 1, width + 1), np.int16)
         centres = np.empty((height + 1, width + 1), np.int16)
-        row, context, under = np.empty(width, np.int16), np.empty(width, np.uint8), np.empty(width, np.int16)
+        row, under = np.empty(width, np.int16), np.empty(width, np.int16)
+        context, residual = np.empty(width, np.uint8), np.empty(width, np.uint8)
         _frame_corners(plane, stride, corners)
         for band in range(3):
             down = 0 if band == _COLUMNS else half
@@ -142,7 +156,8 @@ def restore_plane(reference: I16, symbols: U8, cursors: I64, pixels: U8) -> None
                 for x in range(width):
                     under[x] = reference[stride * y + down, stride * x + right]
                 _predict_row(_neighbour_rows(band, corners, centres, y), row, context)
-                _add_residuals(row, context, under, symbols, cursors)
+                _take_residuals(context, symbols, cursors, residual)
+                _add_residuals(row, residual, under)
                 if band == _CENTRES:
                     _frame_centres(row, y, centres)
                 for x in range(width):
@@ -162,12 +177,14 @@ def restore_greens(mosaic: U8, symbols: U8, cursors: I64) -> I16:
     height, width = mosaic.shape[0] // 2, mosaic.shape[1] // 2
     corners = np.empty((height + 1, width + 1), np.int16)
     centres = np.empty((height + 1, width + 1), np.int16)
-    row, context, zeros = np.empty(width, np.int16), np.empty(width, np.uint8), np.zeros(width, np.int16)
+    row, zeros = np.empty(width, np.int16), np.zeros(width, np.int16)
+    context, residual = np.empty(width, np.uint8), np.empty(width, np.uint8)
     greens = np.empty((2, height, width), np.int16)
     _frame_corners(mosaic, 2, corners)
     for y in range(height):
         _predict_row(_neighbour_rows(_CENTRES, corners, centres, y), row, context)
-        _add_residuals(row, context, zeros, symbols, cursors)
+        _take_residuals(context, symbols, cursors, residual)
+        _add_residuals(row, residual, zeros)
         _frame_centres(row, y, centres)
         for x in range(width):
             mosaic[2 * y + 1, 2 * x + 1] = row[x]

@@ -17,7 +17,7 @@ from support.real_data import real_data
 ALL = [codec(codec_id) for codec_id in COLOR_CODECS + DEPTH_CODECS]
 LOSSLESS = [one for one in ALL if one.lossless]
 
-SHAPES = [(480, 640), (488, 640), (1, 1), (1, 7), (9, 1), (2, 2), (31, 33), (97, 130)]
+SHAPES = [(480, 640), (488, 640), (1, 4096), (1, 1), (1, 7), (9, 1), (2, 2), (31, 33), (97, 130)]
 
 every_codec = pytest.mark.parametrize("one", ALL, ids=lambda one: one.name)
 every_lossless_codec = pytest.mark.parametrize("one", LOSSLESS, ids=lambda one: one.name)
