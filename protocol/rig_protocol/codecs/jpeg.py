@@ -9,7 +9,7 @@ from rig_protocol.codecs.base import Bytes, Image, ImageKind, check_image, pack_
 from rig_protocol.errors import DataError
 
 QUALITY = 90
-"""Where JPEG artefacts of natural images sink into the sensor's noise."""
+"""The setting usual where the picture matters more than the last bytes."""
 
 _COMPONENTS = {"bgr": 3, "grey": 1}
 _FLAGS = {"bgr": cv2.IMREAD_COLOR, "grey": cv2.IMREAD_GRAYSCALE}
