@@ -1,8 +1,7 @@
 """One robust adjustment of all camera states and all points (Triggs et al., "Bundle Adjustment", 2000).
 
 Levenberg-Marquardt on iteratively reweighted least squares with a Cauchy kernel; the points are eliminated
-by the Schur complement. Every camera carries priors: on its pose (the drawing) and on its depth bias. Colour
-intrinsics stay as they are, but the normal matrix holds what they would change, for the covariance.
+by the Schur complement. Every camera carries priors: on its pose (the drawing), depth bias, intrinsics.
 """
 
 from collections.abc import Mapping, Sequence
@@ -237,8 +236,7 @@ def _step(
     problem: _Problem, states: Sequence[CameraState], points: Array, system: _Linearised, damping: float
 ) -> tuple[tuple[CameraState, ...], Array]:
     normal, gradient, V_inverse = _reduce(problem, system, damping)
-    free = np.tile(np.arange(problem.state_size) < problem.state_size - INTRINSIC_TERMS, len(states))
-    free &= np.diag(normal) > 0.0
+    free = np.diag(normal) > 0.0
     delta = np.zeros(len(gradient))
     delta[free] = -np.linalg.solve(normal[np.ix_(free, free)], gradient[free])
     by_camera = delta.reshape(len(states), problem.state_size)

@@ -13,7 +13,9 @@ Matches = npt.NDArray[np.intp]
 _FLANN_KD_TREE = 1
 
 
-def mutual_matches(a: Keypoints, b: Keypoints, regions: tuple[Region, Region], ratio: float) -> Matches:
+def mutual_matches(
+    a: Keypoints, b: Keypoints, regions: tuple[Region, Region], ratio: float, max_distance: float
+) -> Matches:
     """Matches that are nearest both ways and clearly nearer than the second-nearest place (Lowe 2004)."""
     rows, columns = (np.flatnonzero(r.contains(k.pixels)) for r, k in zip(regions, (a, b), strict=True))
     if len(rows) < 2 or len(columns) < 2:
@@ -26,7 +28,7 @@ def mutual_matches(a: Keypoints, b: Keypoints, regions: tuple[Region, Region], r
     # The same place described for another orientation is no competitor.
     same_place = b.place[columns][None, :] == b.place[columns][nearest][:, None]
     second = np.where(same_place, np.inf, distance).min(axis=1)
-    keep = mutual & (best < ratio * second)
+    keep = mutual & (best < ratio * second) & (best < max_distance)
     return _one_a_place(np.column_stack([rows[keep], columns[nearest[keep]]]), best[keep], a, b)
 
 

@@ -41,11 +41,17 @@ def write_outputs(
     tell = progress or (lambda _stage, _share: None)
     calibration.save(folder / "calibration.json")
     tell("fusion", 0.0)
+    fused = write_fused(folder, calibration, views)
+    tell("report", 0.5)
+    write_report(folder / "report.html", calibration, views, evidence, poses_before, fused)
+    tell("report", 1.0)
+    return fused
+
+
+def write_fused(folder: Path, calibration: RigCalibration, views: Sequence[CameraView]) -> FusedRig:
+    """Fuse a capture and write cloud.ply and, when any camera could be placed, panorama.png."""
     fused = fuse_rig(views, calibration)
     write_ply(folder / "cloud.ply", fused.cloud)
     if fused.panorama is not None:
         write_panorama(folder / "panorama.png", fused.panorama)
-    tell("report", 0.5)
-    write_report(folder / "report.html", calibration, views, evidence, poses_before, fused)
-    tell("report", 1.0)
     return fused

@@ -20,17 +20,17 @@ class CalibrationSettings(Settings):
     """Strongest SIFT keypoints kept of one image."""
     match_ratio: Annotated[float, Field(gt=0, lt=1)] = 0.85
     """`joint`: nearest over second-nearest descriptor distance of a match."""
+    match_max_distance: Positive = 250.0
+    """`joint`: largest descriptor distance of a match; what looks less alike is also placed less well."""
     match_distance_multiple: Annotated[float, Field(gt=1)] = 4.0
     """`paper`: largest descriptor distance as a multiple of the smallest (table I of the paper)."""
-    pixel_sigma: Positive = 0.5
-    """Standard deviation of a keypoint's position, pixels."""
-    disparity_sigma: Positive = 0.5
-    """Standard deviation of a keypoint's disparity, raw steps."""
+    pixel_sigma: Positive = 0.25
+    """Standard deviation of a small keypoint's position, pixels; large ones are placed less well."""
     bias_terms: Annotated[int, Field(ge=0, le=6)] = 6
     """Depth-bias states of a camera: terms of `DepthCorrection`."""
     bias_scale_sigma: Positive = 0.015
     """Prior standard deviation of the depth scale."""
-    bias_shape_sigma: Positive = 0.01
+    bias_shape_sigma: Positive = 0.02
     """Prior standard deviation of the depth bias's other terms (a unit of x or y is 45 degrees off axis)."""
     min_inliers: Annotated[int, Field(ge=6)] = 8
     """Fewer matches that agree make no edge."""

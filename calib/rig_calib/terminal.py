@@ -1,16 +1,20 @@
 """A calibration as tables for the terminal: what `rig-calib solve` and `rig-server --calibrate` print."""
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 
-from rich import box
-from rich.console import Group, RenderableType
+from rich import box, progress
+from rich.console import Console, Group, RenderableType
 from rich.markup import escape
+from rich.progress import BarColumn, TextColumn, TimeElapsedColumn
 from rich.table import Table
 from rich.text import Text
 
+from rig_calib.evaluation import ErrorSummary, Evaluation
 from rig_calib.figures.tables import camera_rows, edge_rows, key_figures, verdict
 from rig_calib.fusion.viewpoint import rig_viewpoint
 from rig_calib.rig_calibration import RigCalibration
+from rig_calib.stages import Progress
 from rig_calib.view import CameraView
 
 _CAMERA_COLUMNS = {
@@ -31,7 +35,23 @@ _EDGE_COLUMNS = {
     "used": "used",
     "why not": "reason",
 }
-_TEXT_COLUMNS = {"camera", "edge", "why not"}
+_SUMMARY_NAMES = {
+    "neighbours": "neighbours",
+    "used": "used edges",
+    "near": "near pairs",
+    "absolute": "cameras, aligned",
+}
+_ERROR_COLUMNS = ("error of", "count", "mean °", "mean mm", "median °", "median mm", "max °", "max mm")
+_TEXT_COLUMNS = {"camera", "edge", "why not", "error of"}
+
+
+@contextmanager
+def progress_bar(console: Console) -> Iterator[Progress]:
+    """A bar on the console; what it yields is told the stage and the share that is done."""
+    columns = (TextColumn("{task.description:<12}"), BarColumn(), TimeElapsedColumn())
+    with progress.Progress(*columns, console=console, transient=True) as bar:
+        task = bar.add_task("load", total=1.0)
+        yield lambda stage, share: bar.update(task, description=stage, completed=share)
 
 
 def calibration_tables(calibration: RigCalibration, views: Sequence[CameraView]) -> RenderableType:
@@ -50,13 +70,33 @@ def calibration_tables(calibration: RigCalibration, views: Sequence[CameraView])
     )
 
 
-def _table(columns: dict[str, str], rows: Sequence[dict[str, str]]) -> Table:
-    table = Table(box=box.SIMPLE_HEAD, pad_edge=False, padding=(0, 1, 0, 0))
-    for heading in columns:
-        text = heading in _TEXT_COLUMNS
-        table.add_column(heading, justify="left" if text else "right", no_wrap=heading != "why not")
+def evaluation_table(evaluation: Evaluation) -> RenderableType:
+    """Errors against the truth: of neighbours, used edges and near pairs, and of cameras after alignment."""
+    table = _empty_table(_ERROR_COLUMNS)
+    shown: list[ErrorSummary] = []
+    for name, summary in evaluation.summaries().items():
+        if summary in shown:  # in a full ring neighbours, used edges and near pairs are the same
+            continue
+        shown.append(summary)
+        errors = (summary.mean, summary.median, summary.max)
+        figures = [text for error in errors for text in (f"{error.deg:.3f}", f"{error.mm:.2f}")]
+        table.add_row(_SUMMARY_NAMES.get(name, name), str(summary.count), *figures)
+    missing = ", ".join(map(str, evaluation.missing))
+    return Group(table, Text(f"without an estimate: cameras {missing}")) if missing else table
+
+
+def _table(columns: Mapping[str, str], rows: Sequence[Mapping[str, str]]) -> Table:
+    table = _empty_table(columns)
     for row in rows:
         table.add_row(*(escape(row.get(key, "–")) for key in columns.values()))
+    return table
+
+
+def _empty_table(headings: Iterable[str]) -> Table:
+    table = Table(box=box.SIMPLE_HEAD, pad_edge=False, padding=(0, 1, 0, 0))
+    for heading in headings:
+        text = heading in _TEXT_COLUMNS
+        table.add_column(heading, justify="left" if text else "right", no_wrap=heading != "why not")
     return table
 
 

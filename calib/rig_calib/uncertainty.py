@@ -1,8 +1,4 @@
-"""How well the poses are known: covariances from the normal matrix of an adjustment.
-
-States that were held at their prior mean but are not known exactly ("considered", Schmidt 1966) pass their
-uncertainty on to the others.
-"""
+"""How well the poses are known: covariances from the normal matrix of an adjustment."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -39,26 +35,19 @@ class PoseCovariance:
 
 
 def pose_covariance(adjustment: Adjustment, cameras: Sequence[AdjustedCamera]) -> PoseCovariance:
-    """Covariance of all poses; depth bias marginalised, intrinsics considered.
+    """Covariance of all poses with every other state marginalised.
 
     The frame is that of the adjustment: the fixed camera's, or the drawing's.
     """
     count = len(cameras)
     size = len(adjustment.normal) // count
-    considered = np.zeros((count, size), dtype=bool)
-    considered[:, size - len(cameras[0].intrinsics_sigma) :] = True
-    estimated = ~considered
-    for c, camera in enumerate(cameras):
-        if camera.fixed_pose:
-            estimated[c, POSE] = False
-    a, b = np.flatnonzero(estimated), np.flatnonzero(considered)
-    information = adjustment.normal[np.ix_(a, a)] + _VAGUE_INFORMATION * np.eye(len(a))
-    covariance = _symmetric(np.asarray(np.linalg.inv(information), dtype=np.float64))
-    sensitivity = covariance @ adjustment.normal[np.ix_(a, b)]
-    prior = np.concatenate([camera.intrinsics_sigma for camera in cameras]) ** 2
-    covariance = covariance + (sensitivity * prior) @ sensitivity.T
+    free = np.ones((count, size), dtype=bool)
+    free[[c for c, camera in enumerate(cameras) if camera.fixed_pose], POSE] = False
+    rows = np.flatnonzero(free)
+    information = adjustment.normal[np.ix_(rows, rows)] + _VAGUE_INFORMATION * np.eye(len(rows))
+    covariance = np.asarray(np.linalg.inv(information), dtype=np.float64)
     full = np.zeros((count * size, count * size))
-    full[np.ix_(a, a)] = _symmetric(covariance)
+    full[np.ix_(rows, rows)] = 0.5 * (covariance + covariance.T)
     return PoseCovariance(full.reshape(count, size, count, size)[:, POSE, :, POSE])
 
 
@@ -67,7 +56,3 @@ def weakest_direction(covariance: Array) -> tuple[float, float]:
     rotation = np.linalg.eigvalsh(covariance[:3, :3])[-1]
     translation = np.linalg.eigvalsh(covariance[3:, 3:])[-1]
     return float(np.rad2deg(np.sqrt(max(rotation, 0.0)))), float(np.sqrt(max(translation, 0.0)))
-
-
-def _symmetric(matrix: Array) -> Array:
-    return np.asarray(0.5 * (matrix + matrix.T))

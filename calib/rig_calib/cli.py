@@ -1,0 +1,162 @@
+"""The program `rig-calib`: calibrates a rig folder, compares with a truth, fuses, measures intrinsics."""
+
+import json
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import typer
+
+from rig_protocol.programs import run_program, set_up_logging
+
+if TYPE_CHECKING:  # heavy: imported where they are used, so that --help is quick
+    from rig_calib.rig_calibration import RigCalibration
+
+_EXAMPLES = """
+**Examples**
+
+`rig-calib solve captures/office --out results` — calibrate a rig folder, write calibration, report, cloud
+
+`rig-calib evaluate results/calibration.json captures/office/truth.json` — errors against known poses
+
+`rig-calib fuse captures/hall --calibration results/calibration.json --out hall` — fuse another capture
+
+`rig-calib intrinsics board/*.png --board 9x6 --square-mm 25 --out unit.json` — measure one colour camera
+"""
+
+app = typer.Typer(
+    add_completion=False,
+    rich_markup_mode="markdown",
+    no_args_is_help=True,
+    epilog=_EXAMPLES,
+    help="Calibrate a ring of RGB-D cameras from what they see, and fuse it.",
+    context_settings={"help_option_names": ["-h", "--help"]},
+)
+
+Folder = Annotated[Path, typer.Argument(help="Rig folder: nominal.json and one subfolder a camera.")]
+Out = Annotated[Path, typer.Option(help="Folder for the results.")]
+Frames = Annotated[
+    int | None, typer.Option(min=1, max=100, help="Panoramic frames to use; default: all, at most 100.")
+]
+AsJson = Annotated[bool, typer.Option("--json", help="Print the result as JSON, and nothing else.")]
+
+
+@app.command()
+def solve(
+    folder: Folder,
+    out: Out,
+    method: Annotated[
+        str | None, typer.Option(metavar="joint|paper", help="Default: joint. paper: as in the publication.")
+    ] = None,
+    frames: Frames = None,
+    seed: Annotated[int | None, typer.Option(help="Of every random choice.")] = None,
+    as_json: AsJson = False,
+) -> None:
+    """Calibrate a rig folder; exit 1 when the result fails its quality gate, with the files still written."""
+    from rich.console import Console
+
+    from rig_calib.outputs import make_output_folder, write_outputs
+    from rig_calib.rig_folder_calibration import solve_folder
+    from rig_calib.settings import CalibrationSettings
+    from rig_calib.terminal import calibration_tables, progress_bar
+    from rig_protocol.errors import RigError
+    from rig_protocol.settings import load_settings
+
+    set_up_logging("WARNING")
+    settings = load_settings(CalibrationSettings, None, "RIG_CALIB_", {"method": method, "seed": seed})
+    make_output_folder(out)
+    console = Console(quiet=as_json, highlight=False)
+    with progress_bar(console) as tell:
+        result, views = solve_folder(folder, settings, frames, tell)
+        write_outputs(out, result.calibration, views, result.evidence, result.poses_before, tell)
+    console.print(calibration_tables(result.calibration, views))
+    if as_json:
+        _print_json(result.calibration.to_dict())
+    if result.calibration.failures:
+        raise RigError("the calibration fails its gate: " + "; ".join(result.calibration.failures))
+
+
+@app.command()
+def evaluate(
+    calibration: Annotated[Path, typer.Argument(help="A calibration.json.")],
+    truth: Annotated[Path, typer.Argument(help="A truth.json, or the folder that holds it.")],
+    as_json: AsJson = False,
+) -> None:
+    """Errors of a calibration against known poses: of pairs, and of cameras after aligning both rigs."""
+    from rich.console import Console
+
+    from rig_calib.evaluation import evaluate as compare
+    from rig_calib.terminal import evaluation_table
+    from rig_protocol.rig_folder import read_true_poses
+
+    evaluation = compare(_load(calibration), read_true_poses(truth))
+    if as_json:
+        _print_json(evaluation.to_dict())
+    else:
+        Console(highlight=False).print(evaluation_table(evaluation))
+
+
+@app.command()
+def fuse(
+    folder: Folder,
+    calibration: Annotated[Path, typer.Option(help="The calibration.json of this rig.")],
+    out: Out,
+    frames: Frames = None,
+) -> None:
+    """Fuse a rig folder with a calibration into cloud.ply and panorama.png."""
+    from rich.console import Console
+
+    from rig_calib.outputs import make_output_folder, write_fused
+    from rig_calib.rig_folder_calibration import read_views
+    from rig_protocol.rig_folder import read_rig_description
+
+    known = _load(calibration)
+    views = read_views(folder, read_rig_description(folder), frames)
+    make_output_folder(out)
+    fused = write_fused(out, known, views)
+    console = Console(highlight=False)
+    console.print(f"{len(fused.cloud):,} points in {out / 'cloud.ply'}")
+    for why in fused.cloud.skipped:
+        console.print(why, style="yellow")
+
+
+@app.command()
+def intrinsics(
+    images: Annotated[list[Path], typer.Argument(help="Colour images of a checkerboard, ten or more.")],
+    board: Annotated[str, typer.Option(metavar="CxR", help="Inner corners across and down, as 9x6.")],
+    square_mm: Annotated[float, typer.Option(help="Width of one square, measured on the print.")],
+    out: Annotated[Path, typer.Option(help="Intrinsics file to write.")],
+    infrared: Annotated[
+        list[Path] | None, typer.Option(help="Infrared image of the same board; once for each colour image.")
+    ] = None,
+) -> None:
+    """Measure one unit's intrinsics with a checkerboard: libfreenect knows no colour focal length."""
+    from rich.console import Console
+
+    from rig_calib.checkerboard import Board
+    from rig_calib.intrinsics import run
+
+    estimate = run(images, Board.parse(board, square_mm), out, infrared or ())
+    color = estimate.color.intrinsics
+    Console(highlight=False).print(
+        f"fx {color.fx:.2f} fy {color.fy:.2f} cx {color.cx:.2f} cy {color.cy:.2f} px, "
+        f"rms {estimate.color.rms_px:.3f} px, written to {out}"
+    )
+
+
+def main() -> None:
+    """Entry point of `rig-calib`."""
+    run_program(app)
+
+
+def _load(path: Path) -> "RigCalibration":
+    from rig_calib.rig_calibration import RigCalibration
+
+    return RigCalibration.load(path)
+
+
+def _print_json(values: dict[str, Any]) -> None:
+    typer.echo(json.dumps(values, indent=1))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,54 @@
+"""ObservedCamera: a camera's keypoints with their depth, all that the later stages need of its images."""
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from rig_calib.depth_model import DepthGrid, depth_grid, disparity_image
+from rig_calib.features import Keypoints, detect, mean_grey
+from rig_calib.keypoint_depth import KeypointDepth, keypoint_depth, keypoint_points, mean_disparity
+from rig_calib.overlap import Region
+from rig_calib.registration import Side
+from rig_calib.view import CameraView
+
+Array = npt.NDArray[np.float64]
+Index = npt.NDArray[np.intp]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ObservedCamera:
+    """Keypoints of the colour image and, row by row, their depth and their points in the colour camera."""
+
+    view: CameraView
+    grid: DepthGrid
+    keypoints: Keypoints
+    depth: KeypointDepth
+    points: Array
+
+    def side(self, rows: Index) -> Side:
+        """What registration needs of the keypoints that the rows name."""
+        return Side(self.view.model.color, self.keypoints.pixels[rows], self.points[rows])
+
+
+def missing_images(view: CameraView) -> str | None:
+    """Why a view cannot be calibrated, or None when it can."""
+    if not view.color:
+        return "no colour image"
+    if not view.raw and not view.depth_mm:
+        return "no depth image"
+    return None
+
+
+def observe(view: CameraView, region: Region, max_keypoints: int) -> ObservedCamera:
+    """Detect keypoints in a region and look up their depth; all frames of the view are averaged.
+
+    DataError when the depth images do not fit the camera model.
+    """
+    grid = depth_grid(view.model, view.depth_frame)
+    frames = len(view.raw) or len(view.depth_mm)
+    disparity = mean_disparity([disparity_image(view, frame) for frame in range(frames)])
+    keypoints = detect(mean_grey(view.color), region, max_keypoints)
+    depth = keypoint_depth(view.model.color, grid, disparity, keypoints.pixels, frames)
+    points = keypoint_points(view.model.color, grid, keypoints.pixels, depth)
+    return ObservedCamera(view, grid, keypoints, depth, points)

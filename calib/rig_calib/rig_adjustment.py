@@ -1,0 +1,107 @@
+"""The joint estimate: all poses, points and depth-bias states of observed cameras in one adjustment."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from rig_calib.bundle_adjustment import AdjustedCamera, Adjustment, adjust
+from rig_calib.depth_model import DepthCorrection
+from rig_calib.matching import Matches
+from rig_calib.observation_model import CameraState
+from rig_calib.observed_camera import ObservedCamera
+from rig_calib.settings import CalibrationSettings
+from rig_calib.tracks import Scene, build_scene, build_tracks
+from rig_calib.uncertainty import PoseCovariance, pose_covariance
+from rig_protocol.camera import ModelSource
+from rig_protocol.poses import Pose, inverse
+from rig_protocol.rig_folder import RingDrawing
+
+Array = npt.NDArray[np.float64]
+
+# How far factory, measured and assumed colour intrinsics may be off: relative focal length, principal
+# point in pixels. Units differ from the common default by a percent and several pixels.
+_INTRINSICS_SIGMA: Mapping[ModelSource, tuple[float, float, float]] = {
+    "factory": (0.001, 0.6, 0.6),
+    "file": (0.001, 0.6, 0.6),
+    "default": (0.01, 5.0, 5.0),
+}
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class AdjustedRig:
+    """Poses and depth corrections by camera id, with the joint covariance of the poses."""
+
+    poses: Mapping[int, Pose]
+    corrections: Mapping[int, DepthCorrection | None]
+    covariance: PoseCovariance
+    scene: Scene
+    adjustment: Adjustment
+
+    def covariance_of(self, camera_id: int) -> Array:
+        """Covariance (6,6) of one camera's pose in the adjustment's frame."""
+        return self.covariance.of(self.scene.cameras.index(camera_id))
+
+    def relative(self, i: int, j: int) -> tuple[Pose, Array]:
+        """T_i_j and its covariance (6,6)."""
+        T_i_j = inverse(self.poses[i]) @ self.poses[j]
+        order = self.scene.cameras
+        return T_i_j, self.covariance.relative(order.index(i), order.index(j), T_i_j)
+
+
+def adjust_rig(
+    cameras: Mapping[int, ObservedCamera],
+    matches: Mapping[tuple[int, int], Matches],
+    poses: Mapping[int, Pose],
+    ring: RingDrawing | None,
+    settings: CalibrationSettings,
+) -> AdjustedRig:
+    """Adjust the cameras that have a start in `poses` from matches that are believed.
+
+    With a `ring` the drawing's poses and tolerance are a prior and define the frame; without one the
+    first camera does.
+    """
+    tracks = build_tracks(cameras, {pair: rows for pair, rows in matches.items() if set(pair) <= set(poses)})
+    scene = build_scene(cameras, tracks, poses, settings.pixel_sigma)
+    drawn = ring is not None and any(cameras[c].view.T_rig_nominal is not None for c in poses)
+    adjusted = [
+        _adjusted_camera(
+            cameras[c], poses[c], ring if drawn else None, not drawn and c == scene.cameras[0], settings
+        )
+        for c in scene.cameras
+    ]
+    result = adjust(adjusted, scene.points, scene.observations)
+    states = dict(zip(scene.cameras, result.states, strict=True))
+    return AdjustedRig(
+        poses={c: state.T_rig_camera for c, state in states.items()},
+        corrections={c: _correction(state) for c, state in states.items()},
+        covariance=pose_covariance(result, adjusted),
+        scene=scene,
+        adjustment=result,
+    )
+
+
+def _adjusted_camera(
+    camera: ObservedCamera, start: Pose, ring: RingDrawing | None, fixed: bool, settings: CalibrationSettings
+) -> AdjustedCamera:
+    model = camera.view.model
+    bias_sigma = np.full(settings.bias_terms, settings.bias_shape_sigma)
+    bias_sigma[:1] = settings.bias_scale_sigma
+    pose_sigma = None
+    if ring is not None:
+        pose_sigma = np.repeat([np.deg2rad(ring.tolerance_deg), ring.tolerance_m], 3)
+    return AdjustedCamera(
+        color=model.color,
+        grid=camera.grid,
+        start=CameraState(start, np.zeros(settings.bias_terms), np.zeros(3)),
+        bias_sigma=bias_sigma,
+        intrinsics_sigma=np.array(_INTRINSICS_SIGMA[model.source]),
+        T_prior=None if ring is None else camera.view.T_rig_nominal,
+        pose_sigma=pose_sigma,
+        fixed_pose=fixed,
+    )
+
+
+def _correction(state: CameraState) -> DepthCorrection | None:
+    return DepthCorrection(tuple(state.bias.tolist())) if len(state.bias) else None

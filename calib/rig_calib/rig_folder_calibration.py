@@ -1,0 +1,65 @@
+"""A rig folder calibrated: from files to a result that remembers where it came from."""
+
+import dataclasses
+import platform
+import time
+from datetime import UTC, datetime
+from importlib.metadata import version
+from pathlib import Path
+
+from rig_calib.calibration import CalibrationResult, calibrate
+from rig_calib.settings import CalibrationSettings
+from rig_calib.stages import Progress
+from rig_calib.view import CameraView, views_from_panoramas
+from rig_protocol.errors import ConfigurationError
+from rig_protocol.frames import PanoramicFrame, RgbdFrame
+from rig_protocol.rig_folder import RigDescription, frame_indices, read_frame, read_rig_description
+
+MAX_FRAMES = 100  # more average nothing away that a hundred have not, and fill the memory
+_LIBRARIES = ("kinect-rig", "numpy", "scipy", "opencv-python-headless")
+
+
+def solve_folder(
+    folder: Path, settings: CalibrationSettings, frames: int | None = None, progress: Progress | None = None
+) -> tuple[CalibrationResult, list[CameraView]]:
+    """Calibrate on the first `frames` panoramic frames of a folder (default: all, at most 100).
+
+    ConfigurationError when the folder is none of a rig or holds fewer frames, DataError for a torn file.
+    """
+    started_s = time.perf_counter()
+    description = read_rig_description(folder)
+    views = read_views(folder, description, frames)
+    load_s = time.perf_counter() - started_s
+    result = calibrate(views, description.ring, settings, progress)
+    known = result.calibration
+    calibration = dataclasses.replace(
+        known,
+        created=datetime.now(UTC).isoformat(timespec="seconds"),
+        seconds={**known.seconds, "load": load_s, "total": known.seconds["total"] + load_s},
+        provenance={
+            "source": "folder",
+            "agents": 0,
+            "versions": {"python": platform.python_version()} | {name: version(name) for name in _LIBRARIES},
+            **known.provenance,
+        },
+    )
+    return dataclasses.replace(result, calibration=calibration), views
+
+
+def read_views(folder: Path, description: RigDescription, frames: int | None = None) -> list[CameraView]:
+    """Views of every camera of the folder; a camera may lack frames that others have."""
+    held = {camera.id: frame_indices(folder, camera.name) for camera in description.cameras}
+    indices = sorted({index for own in held.values() for index in own})
+    if not indices or (frames is not None and frames > len(indices)):
+        wanted = "one" if frames is None else frames
+        raise ConfigurationError(f"{folder} holds {len(indices)} panoramic frames, {wanted} asked for")
+    panoramas = []
+    for index in indices[: frames or MAX_FRAMES]:
+        found: dict[int, RgbdFrame | None] = {
+            camera.id: read_frame(folder, camera, index)
+            for camera in description.cameras
+            if index in held[camera.id]
+        }
+        timestamps = [frame.timestamp_ns for frame in found.values() if frame is not None]
+        panoramas.append(PanoramicFrame(index, timestamps[0], found, max(timestamps) - min(timestamps)))
+    return views_from_panoramas(description, panoramas)
