@@ -41,6 +41,10 @@ class Link(Protocol):
         """Take datagrams of one sender; the buffer is reused after the call."""
         ...
 
+    def receive_datagram(self, data: bytes, address: Address, now_ns: int) -> None:
+        """Take one datagram."""
+        ...
+
     def datagrams_to_send(self, now_ns: int) -> list[tuple[bytes, Address]]:
         """What to send now."""
         ...
@@ -145,6 +149,8 @@ class Receiver:
                 self._hand_over((DatagramBatch(received, segment_size),), sender)
             elif size:
                 self._hand_over(self._gatherer.add(received, sender), sender)
+            else:  # no batch can hold an empty datagram, but the link counts it
+                self._link.receive_datagram(b"", sender, rig_time_ns())
         for batch, sender in self._gatherer.flush_all():
             self._hand_over((batch,), sender)
 

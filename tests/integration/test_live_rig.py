@@ -165,7 +165,7 @@ def test_refusals_are_readable_on_the_agent(
         folder_agents(folder, tmp_path, port, [0]) as agents,
     ):
         agents[0].wait_for_log(r"(?i)connected")
-        for camera, told in ((7, r"(?i)camera 7"), (0, r"(?i)slot|already")):
+        for camera, told in ((7, r"id 7\) is not in the rig"), (0, r"(?i)slot|already")):
             other = AgentProcess(tmp_path / f"other{camera}.log", port, [*options, camera]).start()
             try:
                 other.wait_for_log(r"(?i)refuses this camera")

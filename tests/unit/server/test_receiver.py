@@ -38,6 +38,9 @@ class EchoLink:
         self.outgoing += [(bytes(datagram), address) for datagram in batch]
         self.events.append(CameraLeft(len(batch), str(now_ns)))
 
+    def receive_datagram(self, data: bytes, address: Address, now_ns: int) -> None:
+        self.batches.append([data])
+
     def datagrams_to_send(self, now_ns: int) -> list[tuple[bytes, Address]]:
         self.served_ns = now_ns
         out, self.outgoing = self.outgoing, []
@@ -131,7 +134,7 @@ def test_answers_of_the_link_go_back_to_the_sender(sender: socket.socket) -> Non
         rigged.receiver.stop()
 
 
-def test_an_empty_datagram_is_ignored(sender: socket.socket) -> None:
+def test_an_empty_datagram_reaches_the_link_which_counts_it(sender: socket.socket) -> None:
     rigged = Rigged(EchoLink())
     try:
         sender.sendto(b"", rigged.receiver.address)
@@ -139,7 +142,7 @@ def test_an_empty_datagram_is_ignored(sender: socket.socket) -> None:
         rigged.wait_for_datagrams(1)
     finally:
         rigged.receiver.stop()
-    assert rigged.link.batches == [[b"x"]]
+    assert rigged.link.batches == [[b""], [b"x"]]
 
 
 def test_the_time_out_of_the_link_fires_without_any_traffic() -> None:
