@@ -6,8 +6,8 @@ from pathlib import Path
 
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
-from rig_calib.evaluation import evaluate
 
+from rig_calib.evaluation import evaluate
 from rig_calib.outputs import write_outputs
 from rig_calib.rig_calibration import RigCalibration
 from rig_calib.terminal import calibration_tables, evaluation_table
@@ -46,9 +46,10 @@ def calibrate_rig(rig: Rig, folder: Path, console: Console) -> None:
     console.print(
         f"wrote calibration.json, report.html, cloud.ply, panorama.png to {folder}; capture "
         f"{collected_s - started_s:.1f} s, calibration {calibrated_s - collected_s:.1f} s, "
-        f"pictures {time.monotonic() - calibrated_s:.1f} s"
+        f"pictures {time.monotonic() - calibrated_s:.1f} s",
+        soft_wrap=True,
     )
-    if truth is not None:
+    if truth is not None and calibration.cameras:
         _compare(calibration, truth, folder, console)
     if calibration.failures:
         raise RigError("the calibration fails its gate: " + "; ".join(calibration.failures))
