@@ -38,7 +38,7 @@ class EchoLink:
         self.outgoing += [(bytes(datagram), address) for datagram in batch]
         self.events.append(CameraLeft(len(batch), str(now_ns)))
 
-    def receive_datagram(self, data: bytes, address: Address, now_ns: int) -> None:
+    def receive_datagram(self, data: bytes, _address: Address, _now_ns: int) -> None:
         self.batches.append([data])
 
     def datagrams_to_send(self, now_ns: int) -> list[tuple[bytes, Address]]:
