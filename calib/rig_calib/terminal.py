@@ -1,6 +1,6 @@
 """A calibration as tables for the terminal: what `rig-calib solve` and `rig-server --calibrate` print."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 
 from rich import box, progress
