@@ -1,13 +1,11 @@
 """A rig folder calibrated: from files to a result that remembers where it came from."""
 
 import dataclasses
-import platform
 import time
-from datetime import UTC, datetime
-from importlib.metadata import version
 from pathlib import Path
 
 from rig_calib.calibration import CalibrationResult, calibrate
+from rig_calib.provenance import with_provenance
 from rig_calib.settings import CalibrationSettings
 from rig_calib.stages import Progress
 from rig_calib.view import CameraView, views_from_panoramas
@@ -16,7 +14,6 @@ from rig_protocol.frames import PanoramicFrame, RgbdFrame
 from rig_protocol.rig_folder import RigDescription, frame_indices, read_frame, read_rig_description
 
 MAX_FRAMES = 100  # more average nothing away that a hundred have not, and fill the memory
-_LIBRARIES = ("kinect-rig", "numpy", "scipy", "opencv-python-headless")
 
 
 def solve_folder(
@@ -32,16 +29,9 @@ def solve_folder(
     load_s = time.perf_counter() - started_s
     result = calibrate(views, description.ring, settings, progress)
     known = result.calibration
-    calibration = dataclasses.replace(
-        known,
-        created=datetime.now(UTC).isoformat(timespec="seconds"),
-        seconds={**known.seconds, "load": load_s, "total": known.seconds["total"] + load_s},
-        provenance={
-            "source": "folder",
-            "agents": 0,
-            "versions": {"python": platform.python_version()} | {name: version(name) for name in _LIBRARIES},
-            **known.provenance,
-        },
+    seconds = {**known.seconds, "load": load_s, "total": known.seconds["total"] + load_s}
+    calibration = with_provenance(
+        dataclasses.replace(known, seconds=seconds), "folder", 0, settings.model_dump(mode="json")
     )
     return dataclasses.replace(result, calibration=calibration), views
 

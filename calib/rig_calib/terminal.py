@@ -10,7 +10,7 @@ from rich.progress import BarColumn, TextColumn, TimeElapsedColumn
 from rich.table import Table
 from rich.text import Text
 
-from rig_calib.evaluation import ErrorSummary, Evaluation
+from rig_calib.evaluation import Evaluation
 from rig_calib.figures.tables import camera_rows, edge_rows, key_figures, verdict
 from rig_calib.fusion.viewpoint import rig_viewpoint
 from rig_calib.rig_calibration import RigCalibration
@@ -73,14 +73,13 @@ def calibration_tables(calibration: RigCalibration, views: Sequence[CameraView])
 def evaluation_table(evaluation: Evaluation) -> RenderableType:
     """Errors against the truth: of neighbours, used edges and near pairs, and of cameras after alignment."""
     table = _empty_table(_ERROR_COLUMNS)
-    shown: list[ErrorSummary] = []
+    shown: list[list[str]] = []
     for name, summary in evaluation.summaries().items():
-        if summary in shown:  # in a full ring neighbours, used edges and near pairs are the same
-            continue
-        shown.append(summary)
         errors = (summary.mean, summary.median, summary.max)
         figures = [text for error in errors for text in (f"{error.deg:.3f}", f"{error.mm:.2f}")]
-        table.add_row(_SUMMARY_NAMES.get(name, name), str(summary.count), *figures)
+        if figures not in shown:  # in a full ring neighbours, used edges and near pairs are the same
+            shown.append(figures)
+            table.add_row(_SUMMARY_NAMES.get(name, name), str(summary.count), *figures)
     missing = ", ".join(map(str, evaluation.missing))
     return Group(table, Text(f"without an estimate: cameras {missing}")) if missing else table
 

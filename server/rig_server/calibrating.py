@@ -10,12 +10,12 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from rig_calib.evaluation import evaluate
 from rig_calib.outputs import write_outputs
 from rig_calib.rig_calibration import RigCalibration
-from rig_calib.terminal import calibration_tables, evaluation_table
+from rig_calib.terminal import calibration_tables, evaluation_table, progress_bar
 from rig_protocol.errors import RigError
 from rig_protocol.poses import Pose
 from rig_protocol.rig_folder import write_true_poses
 from rig_server.rig import Rig
-from rig_server.sinks.calibrate import CalibrateSink, live_provenance, with_serials
+from rig_server.sinks.calibrate import CalibrateSink, with_agents
 
 _POLL_S = 0.5
 
@@ -30,16 +30,10 @@ def calibrate_rig(rig: Rig, folder: Path, console: Console) -> None:
         sink = _collect(rig, progress)
         truth = rig.true_poses()
         description, hellos = rig.description, rig.hellos
-        provenance = live_provenance(rig.settings, hellos, rig.source)
     collected_s = time.monotonic()
-    with _progress(console) as progress:
-        task = progress.add_task("calibrate", total=1.0)
-
-        def tell(stage: str, share: float) -> None:
-            progress.update(task, description=stage, completed=share)
-
-        result, views = sink.calibrate(description, rig.settings, provenance, tell)
-        calibration = with_serials(result.calibration, hellos)
+    with progress_bar(console) as tell:
+        result, views = sink.calibrate(description, rig.settings.calibration, tell)
+        calibration = with_agents(result.calibration, hellos, rig.settings, rig.source)
         calibrated_s = time.monotonic()
         write_outputs(folder, calibration, views, result.evidence, result.poses_before, tell)
     console.print(calibration_tables(calibration, views))

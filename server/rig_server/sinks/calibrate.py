@@ -1,23 +1,19 @@
 """The calibrating sink: collects panoramic frames, then calibrates on them."""
 
 import dataclasses
-import platform
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from datetime import UTC, datetime
-from importlib.metadata import version
-from typing import Any
+from collections.abc import Iterable, Mapping, Sequence
 
 from rig_calib.calibration import CalibrationResult, calibrate
-
+from rig_calib.provenance import with_provenance
 from rig_calib.rig_calibration import RigCalibration
+from rig_calib.settings import CalibrationSettings
+from rig_calib.stages import Progress
 from rig_calib.view import CameraView, views_from_panoramas
 from rig_protocol.errors import RigError
 from rig_protocol.frames import PanoramicFrame
 from rig_protocol.messages import Hello
 from rig_protocol.rig_folder import RigDescription
 from rig_server.config import RigSettings
-
-_LIBRARIES = ("kinect-rig", "numpy", "scipy", "opencv-python-headless")
 
 
 class CalibrateSink:
@@ -58,21 +54,14 @@ class CalibrateSink:
         return chosen, self._warnings(len(chosen), spare)
 
     def calibrate(
-        self,
-        description: RigDescription,
-        settings: RigSettings,
-        provenance: Mapping[str, Any],
-        progress: Callable[[str, float], None],
+        self, description: RigDescription, settings: CalibrationSettings, progress: Progress
     ) -> tuple[CalibrationResult, list[CameraView]]:
-        """Calibrate on the chosen sets; the result carries the provenance and this sink's warnings."""
+        """Calibrate on the chosen sets; this sink's warnings come before the calibration's own."""
         panoramas, warnings = self.chosen()
         views = views_from_panoramas(description, panoramas)
-        result = calibrate(views, description.ring, settings.calibration, progress)
+        result = calibrate(views, description.ring, settings, progress)
         calibration = dataclasses.replace(
-            result.calibration,
-            created=datetime.now(UTC).isoformat(timespec="seconds"),
-            provenance=provenance,
-            warnings=(*warnings, *result.calibration.warnings),
+            result.calibration, warnings=(*warnings, *result.calibration.warnings)
         )
         return dataclasses.replace(result, calibration=calibration), views
 
@@ -92,21 +81,18 @@ class CalibrateSink:
         return (warning,)
 
 
-def live_provenance(settings: RigSettings, hellos: Mapping[int, Hello], source: str) -> dict[str, Any]:
-    """What a result remembers of its input: source, agents, versions and the effective settings."""
-    return {
-        "source": source,
-        "agents": len(hellos),
-        "agent_software": sorted({hello.software for hello in hellos.values()}),
-        "versions": {"python": platform.python_version()} | {name: version(name) for name in _LIBRARIES},
-        "settings": settings.model_dump(mode="json"),
-    }
-
-
-def with_serials(calibration: RigCalibration, hellos: Mapping[int, Hello]) -> RigCalibration:
-    """The same calibration with the serial numbers that the agents told."""
+def with_agents(
+    calibration: RigCalibration, hellos: Mapping[int, Hello], settings: RigSettings, source: str
+) -> RigCalibration:
+    """The same calibration with what the agents told, its source and the settings of the server."""
     cameras = tuple(
         dataclasses.replace(camera, serial=hellos[camera.id].serial) if camera.id in hellos else camera
         for camera in calibration.cameras
     )
-    return dataclasses.replace(calibration, cameras=cameras)
+    return with_provenance(
+        dataclasses.replace(calibration, cameras=cameras),
+        source,
+        len(hellos),
+        settings.model_dump(mode="json"),
+        agent_software=sorted({hello.software for hello in hellos.values()}),
+    )
