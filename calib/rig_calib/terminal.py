@@ -62,7 +62,7 @@ def calibration_tables(calibration: RigCalibration, views: Sequence[CameraView])
     seconds = {f"{stage} s": f"{value:.1f}" for stage, value in calibration.seconds.items()}
     return Group(
         _table(_CAMERA_COLUMNS, camera_rows(calibration, views, viewpoint)),
-        _table(_EDGE_COLUMNS, edge_rows(calibration, names, ())),
+        *_edges(edge_rows(calibration, names, ())),
         _sentence(figures),
         _sentence(seconds),
         *(Text(f"warning: {warning}", style="yellow") for warning in calibration.warnings),
@@ -82,6 +82,13 @@ def evaluation_table(evaluation: Evaluation) -> RenderableType:
             table.add_row(_SUMMARY_NAMES.get(name, name), str(summary.count), *figures)
     missing = ", ".join(map(str, evaluation.missing))
     return Group(table, Text(f"without an estimate: cameras {missing}")) if missing else table
+
+
+def _edges(rows: Sequence[Mapping[str, str]]) -> list[RenderableType]:
+    """A table of the edges that have support; without a drawing most pairs of a rig have none."""
+    bare = [row["pair"] for row in rows if row["inliers"] == "0"]
+    table = _table(_EDGE_COLUMNS, [row for row in rows if row["inliers"] != "0"])
+    return [table, Text(f"without matches that agree: {', '.join(bare)}")] if bare else [table]
 
 
 def _table(columns: Mapping[str, str], rows: Sequence[Mapping[str, str]]) -> Table:
