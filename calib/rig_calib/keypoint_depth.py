@@ -130,7 +130,7 @@ def _window(disparity: Array, at: Array, half: int) -> tuple[Array, Array, Array
 
 
 def _window_median(disparity: Array, at: Array) -> Array:
-    values = _window(disparity, at, 1)[0].reshape(len(at), -1)
+    values = _window(disparity, at, 1)[0].reshape(len(at), 9)
     out = np.full(len(at), np.nan)
     some = np.isfinite(values).any(axis=1)
     out[some] = np.nanmedian(values[some], axis=1)
@@ -141,10 +141,10 @@ def _fit_planes(disparity: Array, at: Array, half: int) -> tuple[Array, npt.NDAr
     """Least-squares d = a + b·Δcolumn + c·Δrow in each window: (N,3), and where that explains the window."""
     values, columns, rows = _window(disparity, at, half)
     n, side = len(at), 2 * half + 1
-    filled = np.isfinite(values).reshape(n, -1)
+    filled = np.isfinite(values).reshape(n, side * side)
     basis = np.stack(np.broadcast_arrays(1.0, columns[:, None, :], rows[:, :, None]), axis=-1)
     basis = basis.reshape(n, side * side, 3) * filled[..., None]
-    values = np.where(filled, values.reshape(n, -1), 0.0)
+    values = np.where(filled, values.reshape(n, side * side), 0.0)
     enough = filled.mean(axis=1) >= _MIN_FILLED
     normal = np.einsum("nki,nkj->nij", basis, basis) + 1e-9 * np.eye(3)
     plane = np.linalg.solve(normal, np.einsum("nki,nk->ni", basis, values)[..., None])[..., 0]
