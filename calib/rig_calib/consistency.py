@@ -51,6 +51,8 @@ def consistent_graph(
 ) -> ConsistentGraph:
     """Judge edges against each other and, weakly, against the drawing; `nominal` holds known T_rig_camera."""
     usable = {edge.pair: pose_edge(edge) for edge in edges if edge.reason is None}
+    if not camera_ids:
+        return ConsistentGraph({}, tuple(edges), ())
     group = connected_groups(camera_ids, usable)[0]
     inside = {pair: edge for pair, edge in usable.items() if pair[0] in group}
     if not inside:
