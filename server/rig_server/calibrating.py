@@ -59,7 +59,7 @@ def _collect(rig: Rig, progress: Progress) -> CalibrateSink:
     collecting = progress.add_task("panoramic frames", total=capture.frames)
     until_s = time.monotonic() + capture.wait_s
     wanted = True
-    while wanted and time.monotonic() < until_s:
+    while wanted and not rig.ended and time.monotonic() < until_s:
         panorama = rig.next_panorama(_POLL_S)
         if panorama is not None:
             wanted = sink.take(panorama)

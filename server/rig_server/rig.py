@@ -136,7 +136,7 @@ class Rig:
 
     def __iter__(self) -> Iterator[PanoramicFrame]:
         """Panoramic frames as they come; without end when live."""
-        while not self._feed.ended:
+        while not self.ended:
             panorama = self.next_panorama(_POLL_S)
             if panorama is not None:
                 yield panorama
@@ -189,6 +189,11 @@ class Rig:
     def hellos(self) -> Mapping[int, Hello]:
         """What the agents said of themselves, by camera id; empty for a recording."""
         return self._feed.hellos
+
+    @property
+    def ended(self) -> bool:
+        """True when a recording was read to its end; a live rig never ends."""
+        return self._feed.ended
 
     def status(self) -> RigStatus:
         """Rates and losses of every camera, and of the sets."""
