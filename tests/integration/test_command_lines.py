@@ -1,0 +1,86 @@
+"""The programs as a person meets them: mistakes, cameras that do not come, the whole job."""
+
+import json
+from pathlib import Path
+
+import pytest
+
+from rig_calib.evaluation import evaluate
+from rig_calib.rig_calibration import RigCalibration
+from rig_protocol.rig_folder import read_true_poses
+from support.rig_processes import LOOPBACK, folder_agents, free_port, run_program, write_small_rig
+
+
+def test_a_camera_that_never_comes_is_named(tmp_path: Path) -> None:
+    write_small_rig(tmp_path / "rig", cameras=2)
+    port = free_port()
+    config = tmp_path / "rig.toml"
+    config.write_text(
+        f'listen = "{LOOPBACK}:{port}"\n[capture]\nwait_s = 8.0\n'
+        '[[cameras]]\nid = 0\n[[cameras]]\nid = 1\nname = "window"\n'
+    )
+    with folder_agents(tmp_path / "rig", tmp_path, port, [0]):
+        done = run_program("rig_server.cli", "--config", config, "--calibrate", "--out", tmp_path / "out")
+    assert done.returncode == 1, done.stderr
+    assert "window" in done.stderr
+    assert "Traceback" not in done.stderr
+
+
+@pytest.mark.parametrize(
+    ("module", "options", "told"),
+    [
+        ("rig_server.cli", ["--frames", 3], "--calibrate"),
+        ("rig_server.cli", ["--config", "absent.toml"], "absent.toml"),
+        ("rig_server.cli", ["--listen", "nowhere:port"], "nowhere:port"),
+        ("rig_agent.cli", ["--source", "webcam"], "webcam"),
+        ("rig_agent.cli", ["--source", "folder", "--path", "absent", "--camera", 0], "absent"),
+        ("rig_agent.cli", ["--source", "folder", "--fps", -1], "fps"),
+        ("rig_calib.cli", ["solve", "absent", "--out", "out"], "absent"),
+        ("rig_calib.cli", ["evaluate", "absent.json", "absent.json"], "absent.json"),
+    ],
+)
+def test_a_wrong_option_ends_with_2_and_says_which(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, module: str, options: list[object], told: str
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    done = run_program(module, *options)
+    assert done.returncode == 2, done.stderr
+    assert told in done.stderr
+    assert "Traceback" not in done.stderr
+
+
+@pytest.mark.parametrize("module", ["rig_server.cli", "rig_agent.cli"])
+def test_a_misspelt_key_is_answered_with_the_nearest_one(tmp_path: Path, module: str) -> None:
+    config = tmp_path / "settings.toml"
+    config.write_text('log_levle = "INFO"\n')
+    done = run_program(module, "--config", config)
+    assert done.returncode == 2
+    assert "did you mean `log_level`" in done.stderr
+
+
+@pytest.mark.parametrize("module", ["rig_server.cli", "rig_agent.cli", "rig_calib.cli"])
+def test_help_teaches_by_examples(module: str) -> None:
+    done = run_program(module, "--help")
+    assert done.returncode == 0
+    assert "xample" in done.stdout
+
+
+def test_simulated_rig_is_calibrated_fused_and_compared_with_the_truth(tmp_path: Path) -> None:
+    """The demo's job on the reference scene, with one frame and its bar."""
+    done = run_program(
+        "rig_server.cli", "--calibrate", "--simulate", 12, "--frames", 1, "--out", tmp_path, timeout_s=170
+    )
+    assert done.returncode == 0, done.stdout + done.stderr
+    for name in ("calibration.json", "report.html", "cloud.ply", "panorama.png", "truth.json"):
+        assert (tmp_path / name).stat().st_size > 0
+    calibration = json.loads((tmp_path / "calibration.json").read_text())
+    assert calibration["rig_frame"] == "ring"
+    assert len(calibration["cameras"]) == 12
+    assert calibration["provenance"]["source"] == "udp"
+    assert calibration["provenance"]["agents"] == 12
+    errors = evaluate(RigCalibration.load(tmp_path / "calibration.json"), read_true_poses(tmp_path))
+    neighbours = errors.over(errors.neighbours)
+    assert neighbours is not None
+    assert neighbours.count == 12
+    assert neighbours.mean.deg <= 0.15
+    assert neighbours.mean.mm <= 6.0
