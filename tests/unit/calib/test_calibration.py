@@ -1,0 +1,190 @@
+"""The whole pipeline on synthetic keypoints: knocks, absences, determinism, what the gate says."""
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from rig_calib import calibration as pipeline
+from rig_calib.calibration import CalibrationResult, calibrate
+from rig_calib.evaluation import evaluate
+from rig_calib.observed_camera import ObservedCamera
+from rig_calib.settings import CalibrationSettings
+from rig_calib.view import CameraView
+from rig_protocol.poses import Pose, se3_exp
+from support.synthetic_rig import SyntheticRig
+
+SETTINGS = CalibrationSettings()
+Calibrate = Callable[..., CalibrationResult]
+
+
+@pytest.fixture
+def solve(monkeypatch: pytest.MonkeyPatch) -> Calibrate:
+    """Calibrates a synthetic rig: its keypoints take the place of detected ones."""
+
+    def run(
+        rig: SyntheticRig,
+        views: list[CameraView] | None = None,
+        settings: CalibrationSettings = SETTINGS,
+        drawn: bool = True,
+        change: Callable[[ObservedCamera], ObservedCamera] = lambda camera: camera,
+        **options: object,
+    ) -> CalibrationResult:
+        def observe(view: CameraView, *_: object) -> ObservedCamera:
+            seen = rig.observe(view.camera_id, pixel_sigma=0.25, disparity_sigma=0.3, drawn=drawn)
+            return change(seen)
+
+        monkeypatch.setattr(pipeline, "observe", observe)
+        ring = rig.drawing if drawn else None
+        return calibrate(views or rig.views(drawn), ring, settings, **options)
+
+    return run
+
+
+def blind(*camera_ids: int) -> Callable[[ObservedCamera], ObservedCamera]:
+    """Keypoints of these cameras look like nothing that another camera sees."""
+
+    def change(camera: ObservedCamera) -> ObservedCamera:
+        if camera.view.camera_id not in camera_ids:
+            return camera
+        rng = np.random.default_rng(camera.view.camera_id)
+        keypoints = camera.keypoints
+        other = rng.uniform(0, 60, keypoints.descriptors.shape).astype(np.float32)
+        return replace(camera, keypoints=replace(keypoints, descriptors=other))
+
+    return change
+
+
+def nominal_poses(rig: SyntheticRig) -> dict[int, Pose]:
+    return {c: rig.drawing.T_rig_camera(c) for c in range(rig.cameras)}
+
+
+def test_a_ring_is_calibrated_in_its_drawings_frame(solve: Calibrate) -> None:
+    rig = SyntheticRig(bias=0.01)
+    result = solve(rig)
+    calibration = result.calibration
+    errors = evaluate(calibration, rig.truth)
+    summary = errors.over(errors.neighbours)
+    assert summary is not None
+    assert summary.count == 12
+    assert summary.mean.deg < 0.1
+    assert summary.mean.mm < 4.0
+    assert calibration.failures == ()
+    assert calibration.rig_frame == "ring"
+    assert all(camera.covariance is not None for camera in calibration.cameras)
+    assert {edge.used for edge in calibration.edges} == {True}
+    assert len(result.evidence) == 12
+    assert result.poses_before.keys() == rig.truth.keys()
+
+
+def test_the_papers_method_calibrates_and_closes_the_loop(solve: Calibrate) -> None:
+    rig = SyntheticRig()
+    calibration = solve(rig, settings=SETTINGS.model_copy(update={"method": "paper"})).calibration
+    absolute = evaluate(calibration, rig.truth).absolute
+    assert absolute is not None
+    assert absolute.mean.deg < 0.5
+    assert absolute.mean.mm < 15.0
+    loop = calibration.loop_closure
+    assert loop is not None
+    assert loop.before_deg > 0.01
+    assert loop.after_deg < 1e-6
+    assert calibration.method == "paper"
+
+
+def test_a_knocked_camera_is_found_from_its_matches(solve: Calibrate) -> None:
+    """4 degrees and 3 cm out of place: calibrated, warned about, and nobody is worse than the drawing."""
+    rig = SyntheticRig()
+    knock = np.array([0.0, np.deg2rad(4.0), 0.0, 0.03, 0.0, 0.0])
+    rig.truth[5] = rig.truth[5] @ se3_exp(knock)
+    calibration = solve(rig).calibration
+    errors, drawing = (evaluate(poses, rig.truth) for poses in (calibration.poses, nominal_poses(rig)))
+    assert errors.cameras[5].deg < 0.15
+    assert errors.cameras[5].mm < 5.0
+    assert errors.absolute is not None
+    assert drawing.absolute is not None
+    assert errors.absolute.mean.deg < drawing.absolute.mean.deg
+    assert errors.absolute.mean.mm < drawing.absolute.mean.mm
+    assert any("camera 5" in warning and "drawing" in warning for warning in calibration.warnings)
+
+
+def test_a_rig_without_a_drawing_is_calibrated_relative_to_camera_0(solve: Calibrate) -> None:
+    rig = SyntheticRig(cameras=6)
+    calibration = solve(rig, drawn=False).calibration
+    errors = evaluate(calibration, rig.truth).absolute
+    assert errors is not None
+    assert errors.max.deg < 0.2
+    assert len(calibration.edges) == 15
+    assert calibration.rig_frame == "camera 0"
+    assert np.array_equal(calibration.cameras[0].T_rig_camera, np.eye(4))
+    assert not np.any(calibration.cameras[0].covariance)
+
+
+def test_the_same_input_gives_bit_identical_cameras_and_edges(solve: Calibrate) -> None:
+    rig = SyntheticRig(cameras=4)
+    first, second = (solve(rig).calibration.to_dict() for _ in range(2))
+    assert first["cameras"] == second["cameras"]
+    assert first["edges"] == second["edges"]
+
+
+@pytest.mark.parametrize(
+    ("change", "told"), [({"color": ()}, "no colour image"), ({"raw": ()}, "no depth image")]
+)
+def test_a_camera_without_images_fails_and_the_others_are_solved(
+    solve: Calibrate, change: dict[str, object], told: str
+) -> None:
+    rig = SyntheticRig()
+    views = rig.views()
+    views[3] = replace(views[3], **change)
+    calibration = solve(rig, views).calibration
+    assert len(calibration.failures) == 1
+    assert "camera 3 (cam03)" in calibration.failures[0]
+    assert told in calibration.failures[0]
+    assert sorted(calibration.poses) == [c for c in range(12) if c != 3]
+
+
+def test_a_camera_that_matches_nobody_is_named_with_its_best_partner(solve: Calibrate) -> None:
+    rig = SyntheticRig()
+    calibration = solve(rig, change=blind(8)).calibration
+    failure = next(text for text in calibration.failures if "camera 8" in text)
+    assert "not connected" in failure
+    assert "patterns" in failure
+    assert calibration.camera(8) is None
+    assert len(calibration.cameras) == 11
+
+
+def test_a_missing_overlap_is_warned_about_while_the_other_way_round_holds(solve: Calibrate) -> None:
+    rig = SyntheticRig()
+    middle = np.arctan2(rig.world[:, 1], rig.world[:, 0])
+    hidden = np.abs(middle - np.deg2rad(75.0)) < np.deg2rad(14.0)  # between cameras 2 and 3
+    rig.world[hidden] = (0.0, 0.0, 9.0)
+    calibration = solve(rig).calibration
+    assert calibration.failures == ()
+    assert any("edge 2–3 is not used" in warning for warning in calibration.warnings)
+    assert any("no loop confirms" in warning for warning in calibration.warnings)
+    assert len(calibration.cameras) == 12
+
+
+def test_no_images_at_all_is_a_result_that_failed(solve: Calibrate) -> None:
+    rig = SyntheticRig(cameras=3)
+    views = [replace(view, color=(), raw=()) for view in rig.views()]
+    calibration = solve(rig, views).calibration
+    assert calibration.cameras == ()
+    assert len(calibration.failures) == 3
+
+
+def test_progress_never_runs_backwards_and_every_stage_is_timed(solve: Calibrate) -> None:
+    told: list[tuple[str, float]] = []
+    rig = SyntheticRig(cameras=3)
+    result = solve(rig, progress=lambda stage, share: told.append((stage, share)))
+    shares = [share for _, share in told]
+    assert shares == sorted(shares)
+    assert shares[-1] == pytest.approx(1.0)
+    assert list(result.calibration.seconds) == [
+        "load",
+        "features",
+        "matching",
+        "registration",
+        "optimisation",
+        "total",
+    ]

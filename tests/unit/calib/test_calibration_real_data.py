@@ -1,0 +1,82 @@
+"""The bars of the first version, on a room of another renderer and on real Kinect frames."""
+
+import json
+from pathlib import Path
+
+import pytest
+from typer.testing import CliRunner
+
+from rig_calib.calibration import CalibrationResult
+from rig_calib.cli import app
+from rig_calib.evaluation import evaluate
+from rig_calib.rig_folder_calibration import solve_folder
+from rig_calib.settings import CalibrationSettings
+from rig_protocol.rig_folder import read_true_poses
+from support.real_data import real_data
+
+SETTINGS = CalibrationSettings()
+MOTION_CAPTURE_LIMIT_DEG, MOTION_CAPTURE_LIMIT_MM = 4.0, 100.0
+
+
+@pytest.fixture(scope="module")
+def office() -> tuple[Path, CalibrationResult]:
+    folder = real_data("tum_fr1_rpy_12views")
+    return folder, solve_folder(folder, SETTINGS)[0]
+
+
+def test_a_rendered_room_with_one_frame_meets_its_bar() -> None:
+    folder = real_data("rendered_room")
+    calibration = solve_folder(folder, SETTINGS, frames=1)[0].calibration
+    errors = evaluate(calibration, read_true_poses(folder))
+    neighbours = errors.over(errors.neighbours)
+    assert neighbours is not None
+    assert neighbours.count == 12
+    assert neighbours.mean.deg <= 0.25
+    assert neighbours.mean.mm <= 8.0
+    assert calibration.failures == ()
+
+
+def test_real_views_without_any_prior_meet_their_bar(office: tuple[Path, CalibrationResult]) -> None:
+    folder, result = office
+    errors = evaluate(result.calibration, read_true_poses(folder))
+    near, absolute = errors.over(errors.near), errors.absolute
+    assert len(result.calibration.cameras) == 12
+    assert near is not None
+    assert absolute is not None
+    assert near.median.deg <= 1.2
+    assert near.median.mm <= 25.0
+    assert absolute.max.deg <= MOTION_CAPTURE_LIMIT_DEG
+    assert absolute.max.mm <= MOTION_CAPTURE_LIMIT_MM
+    assert result.calibration.failures == ()
+
+
+def test_plausible_false_pairs_are_dropped_with_a_reason(office: tuple[Path, CalibrationResult]) -> None:
+    """No edge that is used is off by more than motion capture and hand-held motion explain."""
+    folder, result = office
+    errors = evaluate(result.calibration, read_true_poses(folder))
+    assert max(errors.pairs[pair].deg for pair in errors.used) < 5.0
+    assert any(edge.reason and edge.reason.startswith("contradicts") for edge in result.calibration.edges)
+
+
+def test_solving_real_views_again_gives_bit_identical_results(
+    office: tuple[Path, CalibrationResult],
+) -> None:
+    folder, first = office
+    second = solve_folder(folder, SETTINGS)[0]
+    for key in ("cameras", "edges"):
+        assert first.calibration.to_dict()[key] == second.calibration.to_dict()[key]
+
+
+def test_the_command_line_writes_all_files_and_evaluates_them(tmp_path: Path) -> None:
+    folder = real_data("tum_fr1_rpy_12views")
+    run = CliRunner().invoke(
+        app, ["solve", str(folder), "--out", str(tmp_path), "--method", "paper", "--json"]
+    )
+    assert run.exit_code == 0, run.output
+    assert json.loads(run.stdout)["method"] == "paper"
+    for name in ("calibration.json", "report.html", "cloud.ply", "panorama.png"):
+        assert (tmp_path / name).stat().st_size > 0
+    calibration = str(tmp_path / "calibration.json")
+    told = json.loads(CliRunner().invoke(app, ["evaluate", calibration, str(folder), "--json"]).stdout)
+    assert told["near"]["median_deg"] < 2.0
+    assert told["missing"] == []
