@@ -167,14 +167,14 @@ def _solve_jointly(
     ring: RingDrawing | None,
     settings: CalibrationSettings,
 ) -> _Solution:
-    """Adjust everything, look at all matches again with depth corrected, adjust again."""
+    """Adjust everything, look at all matches and at the noise again with depth corrected, adjust again."""
     edges: Sequence[Edge] = graph.edges
     if len(start) < 2:
         return _Solution(cameras, edges, {}, None)
     rig = adjust_rig(cameras, _used_matches(edges), start, ring, settings)
     better = {c: corrected(camera, rig.corrections.get(c)) for c, camera in cameras.items()}
     edges = reselect(better, edges, rig.poses, settings.min_inliers)
-    rig = adjust_rig(cameras, _used_matches(edges), rig.poses, ring, settings)
+    rig = adjust_rig(cameras, _used_matches(edges), rig.poses, ring, settings, rig.noise_scale())
     better = {c: corrected(camera, rig.corrections.get(c)) for c, camera in cameras.items()}
     return _Solution(better, edges, rig.poses, rig)
 

@@ -5,7 +5,7 @@ for the rig; the proposal that most edges agree with starts a pose graph, from w
 dropped until none contradicts.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping, Sequence, Set
 from dataclasses import dataclass
 
 import numpy as np
@@ -20,7 +20,7 @@ from rig_calib.pose_graph import (
     optimise,
     spanning_tree,
 )
-from rig_protocol.poses import Pose, inverse
+from rig_protocol.poses import Pose, inverse, se3_log
 
 Array = npt.NDArray[np.float64]
 
@@ -57,8 +57,10 @@ def consistent_graph(
     inside = {pair: edge for pair, edge in usable.items() if pair[0] in group}
     if not inside:
         return ConsistentGraph({group[0]: np.eye(4)}, tuple(edges), ())
-    start = _best_proposal(inside, group, _drawn(inside, nominal), seed)
-    poses, dropped = _drop_contradictions(inside, start, group[0])
+    drawn = _drawn(inside, nominal)
+    start = _best_proposal(inside, group, list(drawn.values()), seed)
+    confirmed = {pair for pair, drawing in drawn.items() if _agree(inside[pair], drawing)}
+    poses, dropped = _drop_contradictions(inside, start, group[0], confirmed)
     kept = [pair for pair in inside if pair not in dropped]
     ambiguous = [] if nominal else [pair for pair in dropped if _only_one_loop(pair, kept)]
     judged = tuple(edge.refused(dropped[edge.pair]) if edge.pair in dropped else edge for edge in edges)
@@ -84,14 +86,23 @@ def pose_edge(edge: Edge) -> PoseEdge:
     return PoseEdge(edge.i, edge.j, edge.T_i_j, information)
 
 
-def _drawn(measured: Mapping[tuple[int, int], PoseEdge], nominal: Mapping[int, Pose]) -> list[PoseEdge]:
+def _drawn(
+    measured: Mapping[tuple[int, int], PoseEdge], nominal: Mapping[int, Pose]
+) -> dict[tuple[int, int], PoseEdge]:
     """The drawing's relative poses of the measured pairs, loosely: a mount may be off by several degrees."""
     information = np.diag(1.0 / np.repeat([np.deg2rad(2.0), 0.01], 3) ** 2)
-    return [
-        PoseEdge(i, j, inverse(nominal[i]) @ nominal[j], information)
+    return {
+        (i, j): PoseEdge(i, j, inverse(nominal[i]) @ nominal[j], information)
         for i, j in measured
         if i in nominal and j in nominal
-    ]
+    }
+
+
+def _agree(measured: PoseEdge, drawn: PoseEdge) -> bool:
+    """Whether a measured relative pose is the drawn one within the uncertainty of both."""
+    r = se3_log(inverse(measured.T_i_j) @ drawn.T_i_j)
+    covariance = np.linalg.inv(measured.information) + np.linalg.inv(drawn.information)
+    return float(r @ np.linalg.solve(covariance, r)) <= _AGREEMENT
 
 
 def _best_proposal(
@@ -123,15 +134,27 @@ def _squared_distance(edge: PoseEdge, poses: Mapping[int, Pose]) -> float:
 
 
 def _drop_contradictions(
-    edges: Mapping[tuple[int, int], PoseEdge], poses: Mapping[int, Pose], root: int
+    edges: Mapping[tuple[int, int], PoseEdge],
+    poses: Mapping[int, Pose],
+    root: int,
+    confirmed: Set[tuple[int, int]],
 ) -> tuple[Mapping[int, Pose], dict[tuple[int, int], str]]:
-    """Optimise over the edges that agree with the start, then drop, worst first, what contradicts."""
-    kept = {pair: edge for pair, edge in edges.items() if _squared_distance(edge, poses) <= _CONTRADICTION}
+    """Optimise over the edges that agree with the start, then drop, worst first, what contradicts.
+
+    What the drawing confirmed is imprecise, not false, and stays: a long loop adds up many small errors.
+    """
+    kept = {
+        pair: edge
+        for pair, edge in edges.items()
+        if pair in confirmed or _squared_distance(edge, poses) <= _CONTRADICTION
+    }
     while True:
         poses = optimise(poses, list(kept.values()), [root]).poses
-        distances = {pair: _squared_distance(edge, poses) for pair, edge in kept.items()}
-        worst = max(distances, key=lambda pair: distances[pair])
-        if distances[worst] <= _CONTRADICTION:
+        distances = {
+            pair: _squared_distance(edge, poses) for pair, edge in kept.items() if pair not in confirmed
+        }
+        worst = max(distances, key=lambda pair: distances[pair], default=None)
+        if worst is None or distances[worst] <= _CONTRADICTION:
             break
         del kept[worst]
     # An edge that only the rough start refused may agree with the optimised poses.

@@ -16,6 +16,8 @@ from rig_protocol.poses import Pose, adjoint, inverse, transform_points
 Array = npt.NDArray[np.float64]
 
 TOLERANCE = Tolerance()
+# What a percent of depth bias, which the scatter does not show, does to a plain alignment.
+_BIAS_SIGMA = np.repeat([np.deg2rad(0.4), 0.02], 3)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -87,12 +89,12 @@ def estimate_edge(
 
 
 def _paper_estimate(p_i: Array, p_j: Array, start: Pose) -> tuple[Pose, Array]:
-    """Eq. 4 and 5, with the covariance that the residuals' scatter suggests, on the right of T_i_j."""
+    """Eq. 4 and 5, with the covariance that scatter and common depth bias suggest, on the right of T_i_j."""
     T_i_j, normal = minimise_distances(p_i, p_j, start)
     variance = float(((p_i - transform_points(T_i_j, p_j)) ** 2).sum() / max(3 * len(p_i) - 6, 1))
     left = variance * np.linalg.inv(normal + 1e-9 * np.eye(6))
     Ad = adjoint(inverse(T_i_j))
-    return T_i_j, np.asarray(Ad @ left @ Ad.T)
+    return T_i_j, np.asarray(Ad @ left @ Ad.T + np.diag(_BIAS_SIGMA**2))
 
 
 def _weakness(covariance: Array, settings: CalibrationSettings) -> str | None:

@@ -22,7 +22,7 @@ class CalibrationSettings(Settings):
     """`joint`: nearest over second-nearest descriptor distance of a match."""
     match_max_distance: Positive = 250.0
     """`joint`: largest descriptor distance of a match; what looks less alike is also placed less well."""
-    match_distance_multiple: Annotated[float, Field(gt=1)] = 4.0
+    match_distance_multiple: Annotated[float, Field(gt=1)] = 7.0
     """`paper`: largest descriptor distance as a multiple of the smallest (table I of the paper)."""
     pixel_sigma: Positive = 0.25
     """Standard deviation of a small keypoint's position, pixels; large ones are placed less well."""

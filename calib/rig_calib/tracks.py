@@ -1,7 +1,7 @@
 """Tracks: matches of pairs joined to points that two or more cameras observe, ready to be adjusted."""
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
@@ -32,6 +32,16 @@ class Scene:
     cameras: tuple[int, ...]
     observations: Observations
     points: Array
+
+    def noisier(self, pixel: float, disparity: float) -> "Scene":
+        """The scene with standard deviations multiplied."""
+        seen = self.observations
+        scaled = replace(
+            seen,
+            pixel_sigma=seen.pixel_sigma * pixel,
+            disparity_sigma=seen.disparity_sigma * disparity,
+        )
+        return replace(self, observations=scaled)
 
 
 def build_tracks(

@@ -78,3 +78,10 @@ def test_no_edge_at_all_places_one_camera() -> None:
 def test_edges_outside_every_loop_are_unconfirmed() -> None:
     assert unconfirmed([(0, 1), (1, 2), (0, 2), (2, 3)], range(4)) == [(2, 3)]
     assert unconfirmed(RING, range(12)) == []
+
+
+def test_imprecise_edges_that_the_drawing_confirms_are_kept() -> None:
+    """Each edge is 1 degree and 20 mm off the same way, which adds up over the ring; none is false."""
+    bias = se3_exp(np.array([np.deg2rad(1.0), 0, 0, 0.02, 0, 0]))
+    edges = [edge(i, j, bias) for i, j in RING]
+    assert dropped(consistent_graph(edges, range(12), TRUTH, seed=0).edges) == {}
