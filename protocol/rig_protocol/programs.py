@@ -31,11 +31,15 @@ def run_program(app: typer.Typer) -> None:
         sys.exit(EXIT_FAILED)
 
 
-def set_up_logging(level: str = "INFO") -> None:
-    """Log to stderr: with colours on a terminal, plain lines for journald otherwise."""
+def set_up_logging(level: str = "INFO", console: Console | None = None) -> None:
+    """Log to stderr: with colours on a terminal, plain lines for journald otherwise.
+
+    A program that draws on a terminal of its own gives that `console`: lines then appear above what is drawn.
+    """
     handler: logging.Handler
     if sys.stderr.isatty():
-        handler = RichHandler(console=Console(stderr=True), show_path=False, rich_tracebacks=True)
+        shared = console if console is not None and console.is_terminal else Console(stderr=True)
+        handler = RichHandler(console=shared, show_path=False, rich_tracebacks=True)
         handler.setFormatter(logging.Formatter("%(message)s"))
     else:
         handler = logging.StreamHandler()

@@ -83,18 +83,19 @@ def run(
 
     changes = {"listen": listen, "capture": {"frames": frames}, "calibration": {"method": method}}
     settings = load_rig_settings(config, changes)
-    set_up_logging(settings.log_level)
+    console = Console()
+    set_up_logging(settings.log_level, console)
     # What takes a second to import comes after everything that can be refused at once.
     if calibrate:
         from rig_calib.outputs import make_output_folder
         from rig_server.calibrating import calibrate_rig
 
         make_output_folder(folder := out or Path("calibration"))
-        calibrate_rig(_open_rig(settings, simulate, seed), folder, Console())
+        calibrate_rig(_open_rig(settings, simulate, seed), folder, console)
     else:
         from rig_server.receiving import receive
 
-        receive(_open_rig(settings, simulate, seed), Console())
+        receive(_open_rig(settings, simulate, seed), console)
 
 
 @app.command()

@@ -147,8 +147,10 @@ class LivePipeline:
                 logger.warning("camera %d left: %s", camera_id, text)
             case HelloRefused(address, _, text):
                 with self._presence:
+                    # An agent tries on every few seconds; the operator is told once.
+                    told = any(known.address == address and known.text == text for known in self._refusals)
                     self._refusals.append(event)
-                logger.warning("refused %s: %s", address[0], text)
+                logger.log(logging.DEBUG if told else logging.WARNING, "refused %s: %s", address[0], text)
 
     def _metrics(self, camera_id: int, name: str, camera: CameraStatus | None, fps: float) -> CameraMetrics:
         if camera is None:
