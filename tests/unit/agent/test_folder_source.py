@@ -12,21 +12,9 @@ from rig_protocol.errors import ConfigurationError, DataError
 from rig_protocol.frames import RgbdFrame
 from rig_protocol.rig_folder import CameraEntry, RigDescription, write_rig_folder
 from support.real_data import real_data
+from support.virtual_time import VirtualTime
 
 INTERVAL_NS = 100_000_000
-
-
-class VirtualTime:
-    """A clock that only sleeping moves."""
-
-    def __init__(self, now_ns: int = 0) -> None:
-        self.now_ns = now_ns
-
-    def __call__(self) -> int:
-        return self.now_ns
-
-    def sleep(self, seconds: float) -> None:
-        self.now_ns += round(seconds * 1e9)
 
 
 def make_frame(index: int) -> RgbdFrame:

@@ -9,27 +9,15 @@ from rig_agent.sources.base import FrameSource
 from rig_agent.sources.synthetic import SyntheticSource
 from rig_protocol.errors import ConfigurationError
 from rig_protocol.frames import RgbdFrame
+from support.virtual_time import VirtualTime
 
 SETTINGS = SimulatorSettings(cameras=2, seed=3, frames_rendered=1)
 INTERVAL_NS = 33_333_333
 
 
-class VirtualTime:
-    """A clock that only sleeping moves."""
-
-    def __init__(self) -> None:
-        self.now_ns = 10**12
-
-    def __call__(self) -> int:
-        return self.now_ns
-
-    def sleep(self, seconds: float) -> None:
-        self.now_ns += round(seconds * 1e9)
-
-
 @pytest.fixture(scope="module")
 def clock() -> VirtualTime:
-    return VirtualTime()
+    return VirtualTime(10**12)
 
 
 @pytest.fixture(scope="module")
