@@ -90,11 +90,14 @@ class Capture:
             while not self._stopping.is_set():
                 frame = source.read(_READ_TIMEOUT_S)
                 self.last_sign_ns = now_ns()
-                if frame is None or not wanted.accepts(frame.timestamp_ns):
+                if frame is None:
                     continue
                 if offset is None:  # a source that was opened again counts on where the last one ended
                     offset = self._next_sequence - frame.sequence
-                self._deliver(replace(frame, sequence=frame.sequence + offset))
+                if wanted.accepts(frame.timestamp_ns):
+                    self._deliver(replace(frame, sequence=frame.sequence + offset))
+                else:  # left out on purpose: no gap in the count, which tells of frames that were lost
+                    offset -= 1
 
     def _deliver(self, frame: RgbdFrame) -> None:
         self._next_sequence = frame.sequence + 1

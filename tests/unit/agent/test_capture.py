@@ -169,12 +169,18 @@ def test_damaged_frames_are_counted_and_passed_on(start: Start) -> None:
 )
 def test_a_faster_source_is_thinned_evenly(start: Start, max_fps: float | None, kept: range) -> None:
     _, recorder = start(frames(*range(12)), max_fps=max_fps)
-    assert [frame.sequence for frame in recorder.take(len(kept))] == list(kept)
+    assert [frame.timestamp_ns for frame in recorder.take(len(kept))] == [INTERVAL_NS * n for n in kept]
+
+
+def test_frames_left_out_on_purpose_leave_no_gap_and_lost_ones_do(start: Start) -> None:
+    """At half the rate 0, 2, 4, 8 and 10 pass; 6 and 7 never came."""
+    _, recorder = start(frames(0, 1, 2, 3, 4, 5, 8, 9, 10), max_fps=15.0)
+    assert [frame.sequence for frame in recorder.take(5)] == [0, 1, 2, 5, 6]
 
 
 def test_thinning_to_an_odd_rate_keeps_it_on_average(start: Start) -> None:
     capture, recorder = start(frames(*range(300), 10**6), max_fps=20.0)
-    assert recorder.take(201)[-1].sequence == 10**6
+    assert recorder.take(201)[-1].timestamp_ns == 10**6 * INTERVAL_NS
     assert capture.counters.captured == 201
 
 
