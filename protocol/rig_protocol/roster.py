@@ -56,7 +56,7 @@ class Roster:
         for slot in self.slots:
             if serial is not None and slot.serial == serial:
                 return slot
-        at_port = [slot for slot in self.slots if hello.port_path and slot.port_path == hello.port_path]
+        at_port = [slot for slot in self.slots if slot.port_path and _is_at(hello.port_path, slot.port_path)]
         if len(at_port) > 1:
             return unknown_camera(
                 f"port path {hello.port_path} is that of {len(at_port)} slots: {describe(hello)} needs an id"
@@ -88,10 +88,18 @@ def unknown_camera(text: str) -> Reject:
 
 def _contradiction(slot: Slot, hello: Hello) -> Reject | None:
     """A slot bound to one camera refuses another one."""
-    expected = (("serial", slot.serial, known_serial(hello)), ("port path", slot.port_path, hello.port_path))
-    for trait, wanted, stated in expected:
-        if wanted is not None and wanted != stated:
+    expected = (
+        ("serial", slot.serial, known_serial(hello) == slot.serial),
+        ("port path", slot.port_path, _is_at(hello.port_path, slot.port_path or "")),
+    )
+    for trait, wanted, holds in expected:
+        if wanted is not None and not holds:
             return unknown_camera(
                 f"slot {slot.camera_id} ({slot.name}) is for {trait} {wanted}, {describe(hello)} is another"
             )
     return None
+
+
+def _is_at(port_path: str | None, wanted: str) -> bool:
+    """True at that port or behind it: a Kinect's camera (1-2.1) sits behind the hub of its cable (1-2)."""
+    return port_path is not None and (port_path == wanted or port_path.startswith(f"{wanted}."))

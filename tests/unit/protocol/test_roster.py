@@ -34,6 +34,8 @@ def refusal(roster: Roster, camera: Hello, taken: tuple[int, ...] = ()) -> str:
         (hello(0, serial="S0"), 0),
         (hello(serial="S0"), 0),
         (hello(port_path="1-1.2"), 1),
+        (hello(port_path="1-1.2.1"), 1),
+        (hello(1, port_path="1-1.2.1"), 1),
         (hello(serial="S0", port_path="1-1.2"), 0),
         (hello(serial="S9", port_path="1-1.2"), 1),
     ],
@@ -45,6 +47,8 @@ def test_a_camera_gets_the_slot_of_its_id_else_serial_else_port_path(camera: Hel
 def test_a_slot_bound_to_one_camera_refuses_another() -> None:
     assert "slot 0 (front) is for serial S0" in refusal(LISTED, hello(0, serial="S9"))
     assert "slot 1 (left) is for port path 1-1.2" in refusal(LISTED, hello(1, port_path="1-9"))
+    assert "slot 1 (left) is for port path 1-1.2" in refusal(LISTED, hello(1, port_path="1-1.20"))
+    assert "slot 1 (left) is for port path 1-1.2" in refusal(LISTED, hello(1))
     assert "slot 0" in refusal(LISTED, hello(0))
 
 
