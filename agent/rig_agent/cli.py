@@ -109,15 +109,9 @@ def init(
 ) -> None:
     """Write a commented agent.toml: every option with its meaning and default."""
     from rig_agent.config import AgentSettings
-    from rig_protocol.settings_docs import commented_toml
+    from rig_protocol.settings_docs import write_commented_toml
 
-    try:
-        with path.open("w" if force else "x") as file:
-            file.write(commented_toml(AgentSettings))
-    except FileExistsError as error:
-        raise ConfigurationError(f"{path} exists: --force overwrites it, --path writes elsewhere") from error
-    except OSError as error:
-        raise ConfigurationError(f"{path} cannot be written: {error.strerror}") from error
+    write_commented_toml(AgentSettings, path, force)
     typer.echo(f"Wrote {path}. Edit it, then run: rig-agent --config {path}")
 
 

@@ -14,6 +14,7 @@ from typing import Annotated, Any, Literal, Union, get_args, get_origin
 from pydantic import BaseModel
 from pydantic.fields import FieldInfo
 
+from rig_protocol.errors import ConfigurationError
 from rig_protocol.settings import Settings
 
 _WIDTH = 100
@@ -26,6 +27,17 @@ def commented_toml(model: type[Settings]) -> str:
     Removing the `#` before a key gives a valid file. A key that is unset by default shows its example.
     """
     return _document(_commented_lines(model, _defaults(model), ""))
+
+
+def write_commented_toml(model: type[Settings], path: Path, force: bool) -> None:
+    """What `init` does; ConfigurationError when the file cannot be written, or exists and `force` is off."""
+    try:
+        with path.open("w" if force else "x") as file:
+            file.write(commented_toml(model))
+    except FileExistsError as error:
+        raise ConfigurationError(f"{path} exists: --force overwrites it, --path writes elsewhere") from error
+    except OSError as error:
+        raise ConfigurationError(f"{path} cannot be written: {error.strerror}") from error
 
 
 def effective_toml(settings: Settings) -> str:

@@ -101,18 +101,13 @@ def run(
 @app.command()
 def init(
     path: Annotated[Path, typer.Option(help="File to write.", metavar="FILE")] = Path("rig.toml"),
+    force: Annotated[bool, typer.Option("--force", help="Overwrite an existing file.")] = False,
 ) -> None:
     """Write a commented rig.toml that changes nothing yet."""
-    from rig_protocol.settings_docs import commented_toml
+    from rig_protocol.settings_docs import write_commented_toml
     from rig_server.config import RigSettings
 
-    try:
-        with path.open("x") as file:
-            file.write(commented_toml(RigSettings))
-    except FileExistsError:
-        raise ConfigurationError(f"{path} exists: remove it or name another with --path") from None
-    except OSError as error:
-        raise ConfigurationError(f"{path} cannot be written: {error.strerror}") from error
+    write_commented_toml(RigSettings, path, force)
     Console().print(f"wrote {path}; list the cameras in it, then run rig-server", soft_wrap=True)
 
 

@@ -36,13 +36,17 @@ def rig_server(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Prog
     root.setLevel(log_level)
 
 
-def test_init_writes_a_file_that_changes_nothing_and_never_overwrites_one(
+def test_init_writes_a_file_that_changes_nothing_and_overwrites_only_by_force(
     rig_server: Program, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert rig_server("init") == 0
     assert load_rig_settings(tmp_path / "rig.toml") == RigSettings()
+    (tmp_path / "rig.toml").write_text("expected_cameras = 3\n")
     assert rig_server("init") == 2
     assert "rig.toml exists" in capsys.readouterr().err
+    assert load_rig_settings(tmp_path / "rig.toml").expected_cameras == 3
+    assert rig_server("init", "--force") == 0
+    assert load_rig_settings(tmp_path / "rig.toml") == RigSettings()
 
 
 def test_help_teaches_with_examples(rig_server: Program, capsys: pytest.CaptureFixture[str]) -> None:
