@@ -2,7 +2,9 @@
 
 import re
 from collections.abc import Mapping
+from dataclasses import replace
 
+from rig_protocol.camera import CameraModel
 from rig_protocol.messages import Hello
 from rig_protocol.rig_folder import CameraEntry, RigDescription, RingDrawing
 from rig_server.config import CAMERA_NAME, CameraSettings, RigSettings, read_intrinsics
@@ -44,6 +46,19 @@ def _entry(
     return CameraEntry(
         id=camera_id,
         name=name,
-        model=hello.model if file is None else read_intrinsics(file),
+        model=hello.model if file is None else _completed(read_intrinsics(file), hello.model),
         T_rig_camera=None if ring is None else ring.T_rig_camera(camera_id),
     )
+
+
+def _completed(measured: CameraModel, told: CameraModel) -> CameraModel:
+    """A measured model; where it holds only the defaults, the agent's factory calibration knows more.
+
+    `rig-calib intrinsics` without infrared images measures the colour camera alone.
+    """
+    default = CameraModel()
+    if measured.depth in (None, default.depth):
+        measured = replace(measured, depth=told.depth, T_color_depth=told.T_color_depth)
+    if measured.raw_model == default.raw_model:
+        measured = replace(measured, raw_model=told.raw_model)
+    return measured

@@ -1,14 +1,32 @@
 """The rig before calibration: rig.toml and hellos."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import pytest
 
-from rig_protocol.camera import CameraModel
+from rig_protocol.camera import CameraModel, Intrinsics, RawDepthModel
 from rig_protocol.messages import Hello
+from rig_protocol.poses import Pose
 from rig_server.config import CameraSettings, RigSettings, RingSettings
 from rig_server.description import camera_names, describe_rig
+
+
+def pose(x_m: float) -> Pose:
+    T = np.eye(4)
+    T[0, 3] = x_m
+    return T
+
+
+FACTORY = CameraModel(
+    Intrinsics(524, 524, 318, 241),
+    Intrinsics(577, 577, 314, 238),
+    pose(-0.0249),
+    RawDepthModel(346, 1088),
+    "factory",
+)
 
 
 def hello(name: str = "pi") -> Hello:
@@ -48,10 +66,27 @@ def test_the_drawing_gives_nominal_poses() -> None:
     np.testing.assert_allclose(T[:3, 3], [0, 0.3, 0], atol=1e-12)
 
 
-def test_measured_intrinsics_come_before_the_agents(tmp_path: Path) -> None:
-    model = CameraModel(source="file").to_dict()
-    model["color"]["fx"] = 531.5
-    path = tmp_path / "cam00.json"
-    path.write_text(json.dumps(model))
+def described_with_file(folder: Path, measured: CameraModel, told: CameraModel) -> CameraModel:
+    """The model of a camera with an intrinsics file whose agent tells another one."""
+    path = folder / "cam00.json"
+    path.write_text(json.dumps(measured.to_dict()))
     settings = RigSettings(cameras=(CameraSettings(id=0, intrinsics=path),))
-    assert describe_rig(settings, {0: hello()}).camera(0).model.color.fx == 531.5
+    return describe_rig(settings, {0: replace(hello(), model=told)}).camera(0).model
+
+
+def test_measured_intrinsics_come_before_the_agents(tmp_path: Path) -> None:
+    measured = CameraModel(
+        Intrinsics(531.5, 531.0, 320, 240),
+        Intrinsics(575, 575, 310, 242),
+        pose(0.024),
+        RawDepthModel(350, 1090),
+        "file",
+    )
+    assert described_with_file(tmp_path, measured, FACTORY).to_dict() == measured.to_dict()
+
+
+@pytest.mark.parametrize("depth", [None, CameraModel().depth], ids=["no depth side", "the defaults"])
+def test_what_a_file_did_not_measure_stays_the_agents(tmp_path: Path, depth: Intrinsics | None) -> None:
+    measured = CameraModel(Intrinsics(531.5, 531.0, 320, 240), depth, source="file")
+    model = described_with_file(tmp_path, measured, FACTORY)
+    assert model.to_dict() == replace(FACTORY, color=measured.color, source="file").to_dict()
