@@ -174,7 +174,7 @@ def _solve_jointly(
     rig = adjust_rig(cameras, _used_matches(edges), start, ring, settings)
     better = {c: corrected(camera, rig.corrections.get(c)) for c, camera in cameras.items()}
     edges = reselect(better, edges, rig.poses, settings.min_inliers)
-    rig = adjust_rig(cameras, _used_matches(edges), rig.poses, ring, settings, rig.noise_scale())
+    rig = adjust_rig(cameras, _used_matches(edges), rig.poses, ring, settings, rig.observed_noise())
     better = {c: corrected(camera, rig.corrections.get(c)) for c, camera in cameras.items()}
     return _Solution(better, edges, rig.poses, rig)
 

@@ -9,6 +9,7 @@ import numpy.typing as npt
 from rig_calib.bundle_adjustment import AdjustedCamera, Adjustment, adjust
 from rig_calib.depth_model import DepthCorrection
 from rig_calib.matching import Matches
+from rig_calib.noise import NoiseModel, observed_noise
 from rig_calib.observation_model import CameraState
 from rig_calib.observed_camera import ObservedCamera
 from rig_calib.settings import CalibrationSettings
@@ -29,18 +30,7 @@ _INTRINSICS_SIGMA: Mapping[ModelSource, tuple[float, float, float]] = {
 }
 
 
-_MAD_TO_SIGMA = 1.4826  # of a normal distribution
-
-
-@dataclass(frozen=True, slots=True)
-class NoiseScale:
-    """How much noisier than assumed keypoints and disparities are; never less than 1."""
-
-    pixel: float = 1.0
-    disparity: float = 1.0
-
-
-AS_ASSUMED = NoiseScale()
+AT_REST = NoiseModel()
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -57,15 +47,9 @@ class AdjustedRig:
         """Covariance (6,6) of one camera's pose in the adjustment's frame."""
         return self.covariance.of(self.scene.cameras.index(camera_id))
 
-    def noise_scale(self) -> NoiseScale:
-        """From the scatter of the residuals, robustly; each point takes three of them for itself."""
-        residuals, known = self.adjustment.residuals, np.isfinite(self.scene.observations.disparity)
-        count = 2 * len(residuals) + int(known.sum())
-        spent = min(3 * len(self.adjustment.points), count // 2 + 1)
-        to_sigma = _MAD_TO_SIGMA * np.sqrt(count / max(count - spent, 1))
-        pixel = float(np.median(np.abs(residuals[:, :2])) * to_sigma)
-        disparity = float(np.median(np.abs(residuals[known, 2])) * to_sigma)
-        return NoiseScale(max(pixel, 1.0), max(disparity, 1.0))
+    def observed_noise(self) -> NoiseModel:
+        """How noisy the capture turned out to be."""
+        return observed_noise(self.scene.observations, self.adjustment.residuals, len(self.scene.points))
 
     def relative(self, i: int, j: int) -> tuple[Pose, Array]:
         """T_i_j and its covariance (6,6)."""
@@ -80,7 +64,7 @@ def adjust_rig(
     poses: Mapping[int, Pose],
     ring: RingDrawing | None,
     settings: CalibrationSettings,
-    noise: NoiseScale = AS_ASSUMED,
+    noise: NoiseModel = AT_REST,
 ) -> AdjustedRig:
     """Adjust the cameras that have a start in `poses` from matches that are believed.
 
@@ -88,8 +72,7 @@ def adjust_rig(
     first camera does.
     """
     tracks = build_tracks(cameras, {pair: rows for pair, rows in matches.items() if set(pair) <= set(poses)})
-    scene = build_scene(cameras, tracks, poses, settings.pixel_sigma)
-    scene = scene.noisier(noise.pixel, noise.disparity)
+    scene = build_scene(cameras, tracks, poses, settings.pixel_sigma, noise)
     drawn = ring is not None and any(cameras[c].view.T_rig_nominal is not None for c in poses)
     adjusted = [
         _adjusted_camera(

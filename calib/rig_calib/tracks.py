@@ -1,14 +1,13 @@
 """Tracks: matches of pairs joined to points that two or more cameras observe, ready to be adjusted."""
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
-import scipy.spatial
 
-from rig_calib.depth_model import DISPARITY_SIGMA
 from rig_calib.matching import Matches
+from rig_calib.noise import NoiseModel
 from rig_calib.observation_model import Observations
 from rig_calib.observed_camera import ObservedCamera
 from rig_protocol.poses import Pose, transform_points
@@ -16,13 +15,6 @@ from rig_protocol.poses import Pose, transform_points
 Array = npt.NDArray[np.float64]
 Track = dict[int, int]
 """Keypoint row by camera id."""
-
-# What the lookup's standard deviation does not hold: smooth distortion of the unit beyond the bias states.
-_DISTORTION_SIGMA = 1.2 * DISPARITY_SIGMA
-# Distances in the depth image over which the two parts of the error are alike.
-_NOISE_LENGTH_PX, _DISTORTION_LENGTH_PX = 8.0, 40.0
-# A blob is placed to a share of its size (0.05 on two renderers' images, where nothing else is wrong).
-_POSITION_SHARE_OF_SCALE = 0.05
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -32,16 +24,6 @@ class Scene:
     cameras: tuple[int, ...]
     observations: Observations
     points: Array
-
-    def noisier(self, pixel: float, disparity: float) -> "Scene":
-        """The scene with standard deviations multiplied."""
-        seen = self.observations
-        scaled = replace(
-            seen,
-            pixel_sigma=seen.pixel_sigma * pixel,
-            disparity_sigma=seen.disparity_sigma * disparity,
-        )
-        return replace(self, observations=scaled)
 
 
 def build_tracks(
@@ -76,6 +58,7 @@ def build_scene(
     tracks: Sequence[Track],
     poses: Mapping[int, Pose],
     pixel_sigma: float,
+    noise: NoiseModel,
 ) -> Scene:
     """Observations of the tracks that have depth in at least one camera, points started from that depth."""
     ids = tuple(sorted(poses))
@@ -85,31 +68,46 @@ def build_scene(
     point = np.repeat(np.arange(len(tracks)), [len(track) for track in tracks])
     observed = _Columns(cameras, ids, camera, row)
     start = observed.gather(lambda c: transform_points(poses[c.view.camera_id], c.points), 3)
+    points, with_depth = _mean_points(point, start, len(tracks))
+    number = np.cumsum(with_depth) - 1
+    observations = _observations(observed, number[point], pixel_sigma, noise)
+    return Scene(ids, observations.select(with_depth[point]), points[with_depth])
+
+
+def _mean_points(
+    point: npt.NDArray[np.intp], start: Array, count: int
+) -> tuple[Array, npt.NDArray[np.bool_]]:
+    """Mean position (P,3) of each point over the observations that have depth, and which points have any."""
     known = np.isfinite(start[:, 0])
-    depths = np.bincount(point[known], minlength=len(tracks))
-    points = np.stack(
-        [
-            np.bincount(point[known], start[known, axis], len(tracks)) / np.maximum(depths, 1)
-            for axis in range(3)
-        ],
-        axis=1,
-    )
-    keep = depths[point] > 0
-    number = np.cumsum(depths > 0) - 1
+    depths = np.bincount(point[known], minlength=count)
+    sums = [np.bincount(point[known], start[known, axis], count) for axis in range(3)]
+    return np.stack(sums, axis=1) / np.maximum(depths, 1)[:, None], depths > 0
+
+
+def _observations(
+    observed: "_Columns", point: npt.NDArray[np.intp], pixel_sigma: float, noise: NoiseModel
+) -> Observations:
+    pixels = observed.gather(lambda c: c.keypoints.pixels, 2)
     grid_pixels = observed.gather(lambda c: c.depth.grid_pixels, 2)
     scale_px = observed.gather(lambda c: c.keypoints.scale_px, 1)[:, 0]
     lookup_sigma = observed.gather(lambda c: c.depth.sigma, 1)[:, 0]
-    observations = Observations(
-        camera=camera,
-        point=number[point],
-        pixels=observed.gather(lambda c: c.keypoints.pixels, 2),
-        pixel_sigma=np.hypot(pixel_sigma, _POSITION_SHARE_OF_SCALE * scale_px),
+    everything = np.ones(len(point), dtype=bool)
+    return Observations(
+        camera=observed.camera,
+        point=point,
+        pixels=pixels,
+        pixel_sigma=_by_camera(
+            observed.camera, everything, lambda r: noise.keypoint_sigma(pixel_sigma, pixels[r], scale_px[r])
+        ),
         disparity=observed.gather(lambda c: c.depth.disparity, 1)[:, 0],
         slope=observed.gather(lambda c: c.depth.slope, 2),
         grid_pixels=grid_pixels,
-        disparity_sigma=_correlated_sigma(camera, grid_pixels, lookup_sigma),
+        disparity_sigma=_by_camera(
+            observed.camera,
+            np.isfinite(lookup_sigma),
+            lambda r: noise.disparity_sigma(grid_pixels[r], lookup_sigma[r]),
+        ),
     )
-    return Scene(ids, observations.select(keep), points[depths > 0])
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -129,28 +127,14 @@ class _Columns:
         return out
 
 
-def _correlated_sigma(camera: npt.NDArray[np.intp], grid_pixels: Array, lookup_sigma: Array) -> Array:
-    """Standard deviations (M,) that give crowded disparities together the information they hold.
-
-    Errors that n neighbours share are worth one measurement: each variance is multiplied by the number of
-    neighbours, counted by how much they share.
-    """
-    variance = np.full(len(camera), np.nan)
+def _by_camera(
+    camera: npt.NDArray[np.intp],
+    usable: npt.NDArray[np.bool_],
+    sigma: Callable[[npt.NDArray[np.intp]], Array],
+) -> Array:
+    """Standard deviations (M,), one camera's rows at a time; NaN for rows that are not usable."""
+    out = np.full(len(camera), np.nan)
     for c in np.unique(camera):
-        rows = np.flatnonzero((camera == c) & np.isfinite(lookup_sigma))
-        crowd = _crowding(grid_pixels[rows], _NOISE_LENGTH_PX)
-        wide = _crowding(grid_pixels[rows], _DISTORTION_LENGTH_PX)
-        variance[rows] = lookup_sigma[rows] ** 2 * crowd + _DISTORTION_SIGMA**2 * wide
-    return np.asarray(np.sqrt(variance))
-
-
-def _crowding(pixels: Array, length_px: float) -> Array:
-    """Σ exp(−r²/2L²) over all points, itself included: how many share a place (N,)."""
-    if not len(pixels):
-        return np.empty(0)
-    tree = scipy.spatial.KDTree(pixels)
-    near = tree.sparse_distance_matrix(tree, 3.0 * length_px, output_type="coo_matrix")
-    shared = np.exp(-0.5 * (near.data / length_px) ** 2)
-    # The distance of a point to itself is 0, which a sparse matrix may or may not store.
-    off_diagonal = near.row != near.col
-    return np.asarray(1.0 + np.bincount(near.row[off_diagonal], shared[off_diagonal], len(pixels)))
+        rows = np.flatnonzero((camera == c) & usable)
+        out[rows] = sigma(rows)
+    return out
