@@ -95,7 +95,8 @@ class LivePipeline:
         self._decoder.close()
 
     def absence(self) -> str | None:
-        """Which expected cameras are not here and what to do; None when all are."""
+        """Which expected cameras are not here and what to do, or None; RigError when receiving has failed."""
+        self._check_receiver()
         with self._presence:
             since_s = time.monotonic() - self._last_join_s
             if is_whole(self._settings, self._connected, since_s):
@@ -104,8 +105,7 @@ class LivePipeline:
 
     def next_panorama(self, timeout_s: float) -> PanoramicFrame | None:
         """The next set, or None when none came within `timeout_s`; RigError when receiving has failed."""
-        if self._receiver.failure is not None:
-            raise RigError(f"receiving stopped: {self._receiver.failure!r}") from self._receiver.failure
+        self._check_receiver()
         return self._assembler.next_panorama(timeout_s)
 
     def status(self) -> RigStatus:
@@ -127,6 +127,10 @@ class LivePipeline:
             often_missing=often_missing,
             dropped=self._dropped(),
         )
+
+    def _check_receiver(self) -> None:
+        if self._receiver.failure is not None:
+            raise RigError(f"receiving stopped: {self._receiver.failure!r}") from self._receiver.failure
 
     def _on_event(self, event: ServerEvent) -> None:
         """On the receiver's thread: nothing here may wait."""

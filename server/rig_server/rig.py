@@ -143,9 +143,11 @@ class Rig:
 
     def close(self) -> None:
         """End; harmless when already ended."""
-        self._feed.stop()  # first: agents that we end ourselves are no news
-        if self._simulation is not None:
-            self._simulation.close()
+        try:
+            self._feed.stop()  # first: agents that we end ourselves are no news
+        finally:  # also when somebody loses patience and presses Ctrl-C again
+            if self._simulation is not None:
+                self._simulation.close()
 
     def next_panorama(self, timeout_s: float) -> PanoramicFrame | None:
         """The next set; None when none came within `timeout_s`. RigError when the rig broke."""

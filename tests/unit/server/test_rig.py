@@ -1,6 +1,7 @@
 """Rig.open on a recorded rig folder, and what it refuses."""
 
 from pathlib import Path
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -75,3 +76,11 @@ def test_a_folder_without_frames_is_a_configuration_error(tmp_path: Path) -> Non
     write_rig_folder(tmp_path, RigDescription((CameraEntry(0, "cam00", CameraModel()),)), [])
     with pytest.raises(ConfigurationError, match="holds no frames"):
         Rig.open(tmp_path, SETTINGS)
+
+
+def test_simulated_agents_are_ended_even_when_somebody_loses_patience_with_the_server() -> None:
+    feed, simulation = Mock(), Mock()
+    feed.stop.side_effect = KeyboardInterrupt
+    with pytest.raises(KeyboardInterrupt), Rig(feed, SETTINGS, simulation):
+        pass
+    simulation.close.assert_called_once()
