@@ -37,6 +37,20 @@ def test_the_units_run_the_installed_programs_with_their_configuration() -> None
     }
 
 
+def test_a_service_that_keeps_failing_is_started_again_for_ever() -> None:
+    for unit in UNITS:
+        text = unit.read_text()
+        assert "\nRestart=always\n" in text
+        assert "\nStartLimitIntervalSec=0\n" in text
+
+
+def test_systemd_watches_over_the_agent_which_reports_to_it() -> None:
+    """The agent sends READY=1 and WATCHDOG=1; its own limit for a driver that hangs is a minute, too."""
+    text = (DEPLOY / "systemd" / "rig-agent.service").read_text()
+    assert "\nType=notify\n" in text
+    assert "\nWatchdogSec=60\n" in text
+
+
 def test_the_udev_rules_cover_every_kinect_product() -> None:
     rules = (DEPLOY / "udev" / "60-kinect-rig.rules").read_text()
     listed = re.search(r'ATTR\{idProduct\}!="([0-9a-f|]+)"', rules)
