@@ -60,7 +60,7 @@ def test_matches_in_one_corner_are_known_less_well_than_spread_ones() -> None:
         edge = measure_edge(a, b, true_matches(a, b), CalibrationSettings())
         assert edge.covariance is not None
         sigmas.append(weakest_direction(edge.covariance)[0])
-    assert sigmas[0] > 3 * sigmas[1]
+    assert sigmas[0] > 2 * sigmas[1]
 
 
 def test_too_few_matches_say_how_many_there_were() -> None:
