@@ -68,15 +68,22 @@ def test_solving_real_views_again_gives_bit_identical_results(
 
 
 def test_the_command_line_writes_all_files_and_evaluates_them(tmp_path: Path) -> None:
-    folder = real_data("tum_fr1_rpy_12views")
-    run = CliRunner().invoke(
-        app, ["solve", str(folder), "--out", str(tmp_path), "--method", "paper", "--json"]
-    )
+    """Four cameras that look nearly the same way, for speed."""
+    source = real_data("tum_fr1_rpy_12views")
+    folder, out = tmp_path / "rig", tmp_path / "out"
+    folder.mkdir()
+    nominal = json.loads((source / "nominal.json").read_text())
+    nominal["cameras"] = [camera for camera in nominal["cameras"] if camera["id"] in (0, 8, 9, 11)]
+    (folder / "nominal.json").write_text(json.dumps(nominal))
+    for camera in nominal["cameras"]:
+        (folder / camera["name"]).symlink_to(source / camera["name"])
+    run = CliRunner().invoke(app, ["solve", str(folder), "--out", str(out), "--method", "paper", "--json"])
     assert run.exit_code == 0, run.output
     assert json.loads(run.stdout)["method"] == "paper"
     for name in ("calibration.json", "report.html", "cloud.ply", "panorama.png"):
-        assert (tmp_path / name).stat().st_size > 0
-    calibration = str(tmp_path / "calibration.json")
-    told = json.loads(CliRunner().invoke(app, ["evaluate", calibration, str(folder), "--json"]).stdout)
-    assert told["near"]["median_deg"] < 2.0
-    assert told["missing"] == []
+        assert (out / name).stat().st_size > 0
+    told = json.loads(
+        CliRunner().invoke(app, ["evaluate", str(out / "calibration.json"), str(source), "--json"]).stdout
+    )
+    assert told["near"]["median_deg"] < 2.5
+    assert told["missing"] == [1, 2, 3, 4, 5, 6, 7, 10]
