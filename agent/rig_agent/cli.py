@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from rig_protocol.errors import ConfigurationError
-from rig_protocol.programs import run_program, set_up_logging
+from rig_protocol.programs import leave_done, run_program, set_up_logging
 
 if TYPE_CHECKING:  # heavy: imported where they are used, so that --help is quick
     from rig_agent.config import AgentSettings
@@ -74,7 +74,7 @@ def run(
     """
     if context.invoked_subcommand is not None:
         return
-    _on_signals(_leave)  # until the agent runs there is nothing to end in order
+    _on_signals(leave_done)  # until the agent runs there is nothing to end in order
     from rig_agent.config import load_agent_settings
     from rig_protocol.settings_docs import effective_toml
 
@@ -117,7 +117,7 @@ def init(
 
 def main() -> None:
     """Entry point of the program."""
-    run_program(app)
+    run_program(app, on_sigterm=leave_done)
 
 
 def _stream(settings: "AgentSettings") -> None:
@@ -137,10 +137,6 @@ def _stream(settings: "AgentSettings") -> None:
 def _on_signals(action: Any) -> None:
     for number in (signal.SIGTERM, signal.SIGINT):
         signal.signal(number, action)
-
-
-def _leave(*_: object) -> None:
-    raise SystemExit(0)
 
 
 def _write_truth(path: Path, settings: "AgentSettings") -> None:

@@ -4,6 +4,7 @@ import logging
 import os
 import signal
 import sys
+from collections.abc import Callable
 from types import FrameType
 
 import typer
@@ -13,11 +14,22 @@ from rich.logging import RichHandler
 from rig_protocol.errors import RigError
 
 EXIT_DONE, EXIT_FAILED, EXIT_USAGE = 0, 1, 2
+SignalHandler = Callable[[int, FrameType | None], None]
 
 
-def run_program(app: typer.Typer) -> None:
-    """Run a typer app: 0 done, 1 the work failed, 2 wrong usage. SIGTERM ends it as Ctrl-C does."""
-    signal.signal(signal.SIGTERM, _raise_keyboard_interrupt)
+def leave_as_by_ctrl_c(_signal: int, _frame: FrameType | None) -> None:
+    """Handler of a signal that interrupts the work: exit status 130."""
+    raise KeyboardInterrupt
+
+
+def leave_done(_signal: int, _frame: FrameType | None) -> None:
+    """Handler of a signal that is the ordinary end of a service: exit status 0."""
+    raise SystemExit(EXIT_DONE)
+
+
+def run_program(app: typer.Typer, on_sigterm: SignalHandler = leave_as_by_ctrl_c) -> None:
+    """Run a typer app: 0 done, 1 the work failed, 2 wrong usage."""
+    signal.signal(signal.SIGTERM, on_sigterm)
     console = Console(stderr=True, highlight=False)
     try:
         app()
@@ -45,7 +57,3 @@ def set_up_logging(level: str = "INFO", console: Console | None = None) -> None:
         handler = logging.StreamHandler()
         handler.setFormatter(logging.Formatter("%(levelname)s %(name)s: %(message)s"))
     logging.basicConfig(level=level.upper(), handlers=[handler], force=True)
-
-
-def _raise_keyboard_interrupt(_signal: int, _frame: FrameType | None) -> None:
-    raise KeyboardInterrupt

@@ -6,9 +6,9 @@ import sys
 import pytest
 
 PROGRAM = """
-import typer
+import signal, typer
 from rig_protocol.errors import ConfigurationError, DataError, RigError
-from rig_protocol.programs import run_program
+from rig_protocol.programs import leave_done, run_program
 app = typer.Typer()
 @app.command()
 def work(outcome: str) -> None:
@@ -16,8 +16,10 @@ def work(outcome: str) -> None:
               "torn": DataError("a file is torn"), "stopped": KeyboardInterrupt()}
     if outcome in errors:
         raise errors[outcome]
-run_program(app)
+    if outcome == "terminated":
+        signal.raise_signal(signal.SIGTERM)
 """
+TOOL, SERVICE = PROGRAM + "run_program(app)", PROGRAM + "run_program(app, on_sigterm=leave_done)"
 
 
 @pytest.mark.parametrize(
@@ -29,12 +31,18 @@ run_program(app)
         (["usage"], 2, "no such key"),
         (["--nonsense"], 2, "No such option"),
         (["stopped"], 130, ""),
+        (["terminated"], 130, ""),
     ],
 )
 def test_the_exit_status_tells_the_kind_of_failure(arguments: list[str], status: int, message: str) -> None:
     done = subprocess.run(
-        [sys.executable, "-c", PROGRAM, *arguments], capture_output=True, text=True, check=False
+        [sys.executable, "-c", TOOL, *arguments], capture_output=True, text=True, check=False
     )
     assert done.returncode == status
     assert message in done.stderr
     assert "Traceback" not in done.stderr
+
+
+def test_sigterm_is_the_ordinary_end_of_a_service() -> None:
+    done = subprocess.run([sys.executable, "-c", SERVICE, "terminated"], capture_output=True, check=False)
+    assert (done.returncode, done.stderr) == (0, b"")
