@@ -68,6 +68,7 @@ class Agent:
             connections=uplink.connections,
             source_losses=capture.losses,
             network_errors=uplink.network_errors,
+            source=self._capture.source_counters,
         )
 
     def run(self) -> None:

@@ -2,7 +2,8 @@
 
 import logging
 import threading
-from collections.abc import Callable
+from collections import Counter
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 
 from rig_agent.sources.base import FrameSource, SourceDescription, SourceLost
@@ -50,6 +51,9 @@ class Capture:
         self._next_sequence = 0
         self.last_sign_ns = now_ns()
         self.counters = CaptureCounters()
+        self.source_counters: Mapping[
+            str, int
+        ] = {}  # the drivers' own, of all openings; replaced, not changed
 
     def start(self) -> None:
         """Start the thread."""
@@ -87,9 +91,11 @@ class Capture:
             self._on_open(description)
             wanted = _Thinning(description.fps, self._max_fps)
             offset: int | None = None
+            counted_before = Counter(self.source_counters)
             while not self._stopping.is_set():
                 frame = source.read(_READ_TIMEOUT_S)
                 self.last_sign_ns = now_ns()
+                self.source_counters = counted_before + Counter(source.counters)
                 if frame is None:
                     continue
                 if offset is None:  # a source that was opened again counts on where the last one ended

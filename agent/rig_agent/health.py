@@ -1,6 +1,7 @@
 """How the agent is doing: totals of every stage, gauges for the server, a line for the log now and then."""
 
-from dataclasses import dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 from pathlib import Path
 
 _PROCESSOR_TEMPERATURE = Path("/sys/class/thermal/thermal_zone0/temp")  # in 1/1000 °C, on a Pi and most PCs
@@ -26,6 +27,8 @@ class Totals:
     """Times that the device was lost or could not be opened."""
     network_errors: int = 0
     """Sends that the network refused."""
+    source: Mapping[str, int] = field(default_factory=dict)
+    """What the driver counted, by its own names; what is zero may be left out."""
 
 
 def gauges(totals: Totals) -> dict[str, float]:
@@ -34,6 +37,7 @@ def gauges(totals: Totals) -> dict[str, float]:
         "dropped": totals.dropped,
         "damaged": totals.damaged,
         "source_losses": totals.source_losses,
+        **{f"source_{name}": count for name, count in totals.source.items()},
     }
     try:
         found["temperature_c"] = int(_PROCESSOR_TEMPERATURE.read_text()) / 1000
@@ -61,10 +65,11 @@ class HealthLog:
         seconds = max(now_ns - self._since_ns, 1) / 1e9
         captured, sent = totals.captured - self._before.captured, totals.sent - self._before.sent
         self._since_ns, self._before = now_ns, totals
+        source = "".join(f", {count} {name} by the source" for name, count in totals.source.items())
         return (
             f"{'connected' if connected else 'not connected'}: "
             f"captured {captured / seconds:.1f} fps, sent {sent / seconds:.1f} fps; in total "
             f"{totals.sent} sent, {totals.dropped} dropped, {totals.unheard} unheard, "
             f"{totals.damaged} damaged, {totals.connections} connections, "
-            f"{totals.source_losses} device losses, {totals.network_errors} network errors"
+            f"{totals.source_losses} device losses, {totals.network_errors} network errors{source}"
         )

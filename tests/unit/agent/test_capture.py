@@ -26,7 +26,7 @@ class ScriptedSource:
     def __init__(self, steps: list[Step]) -> None:
         self._steps = iter(steps)
         self.closed = False
-        self.counters: Mapping[str, int] = {}
+        self.counters: Mapping[str, int] = {"skipped": 2, "torn": 0}
 
     def describe(self) -> SourceDescription:
         return DESCRIPTION
@@ -114,6 +114,13 @@ def test_a_lost_source_is_opened_again_and_frames_count_on(start: Start) -> None
     capture, recorder = start([*frames(0, 1), SourceLost("unplugged")], frames(0, 1))
     assert [frame.sequence for frame in recorder.take(4)] == [0, 1, 2, 3]
     assert (recorder.opened, capture.counters.losses) == (2, 1)
+
+
+def test_what_the_driver_counted_outlives_its_closing(start: Start) -> None:
+    capture, recorder = start([*frames(0), SourceLost("unplugged")], [*frames(0), DataError("torn")])
+    recorder.take(2)
+    assert recorder.failures.get(5.0) is not None
+    assert capture.source_counters == {"skipped": 4}
 
 
 def test_gaps_that_the_sensor_left_stay_visible(start: Start) -> None:

@@ -25,6 +25,16 @@ def test_rates_are_since_the_last_line_and_counts_since_the_start() -> None:
     assert line.startswith("not connected: captured 20.0 fps, sent 15.0 fps; in total 450 sent, 50 dropped")
 
 
+def test_what_the_driver_counted_is_told_in_the_log_and_to_the_server() -> None:
+    totals = Totals(source={"unpaired": 2, "overrun": 1})
+    assert (
+        HealthLog(10.0, 0)
+        .line(totals, True, 1)
+        .endswith(", 2 unpaired by the source, 1 overrun by the source")
+    )
+    assert gauges(totals).items() >= {"source_unpaired": 2, "source_overrun": 1}.items()
+
+
 @pytest.mark.parametrize(("text", "found"), [("48312\n", 48.312), ("hot", None), (None, None)])
 def test_the_temperature_is_told_where_the_machine_knows_it(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, text: str | None, found: float | None
