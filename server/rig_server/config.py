@@ -47,7 +47,7 @@ class CameraSettings(Settings):
     serial: str | None = Field(None, examples=["A00366A10921051A"])
     """Serial number that the Kinect reports."""
     port_path: str | None = Field(None, examples=["1-1.2"])
-    """USB port on its Pi, for a Kinect that reports no serial number (models 1473 and K4W)."""
+    """USB port of its Pi that the Kinect's cable is in, for a unit without a serial number of its own."""
     intrinsics: Path | None = Field(None, examples=[Path("intrinsics/cam00.json")])
     """Intrinsics measured with `rig-calib intrinsics`; unset: what the agent sends."""
 
