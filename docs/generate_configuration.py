@@ -12,9 +12,9 @@ _TEMPLATE = """# Configuration
 
 Made by `make docs` from the settings models; do not edit.
 
-Every setting can stand in the file or in the environment, some also on the command line. The command line wins
-over the environment, the environment over the file, the file over the default. Unknown keys are refused with
-the nearest known name. In the environment, a key of a table is joined by two underscores:
+Every setting can stand in the file or in the environment, some also on the command line. The command line
+wins over the environment, the environment over the file, the file over the default. Unknown keys are refused
+with the nearest known name. In the environment, a key of a table is joined by two underscores:
 `RIG_AGENT_FREENECT__SERIAL`.
 
 ## agent.toml
