@@ -83,6 +83,16 @@ class Assembler:
         return self._synchroniser.counters.partial
 
     @property
+    def skipped(self) -> int:
+        """Frames left out of every set: a tighter one was possible, or too many waited."""
+        return self._synchroniser.counters.skipped
+
+    @property
+    def implausible(self) -> int:
+        """Frames whose time cannot be true."""
+        return self._synchroniser.counters.implausible
+
+    @property
     def recent(self) -> tuple[SetRecord, ...]:
         """The last sets, oldest first."""
         with self._changed:

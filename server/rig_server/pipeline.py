@@ -178,9 +178,12 @@ class LivePipeline:
     def _dropped(self) -> dict[str, int]:
         return {
             "sets not taken": self._assembler.overrun,
+            "frames left out of sets": self._assembler.skipped,
+            "frames of implausible time": self._assembler.implausible,
             "frames not decoded in time": self._decoder.dropped,
             "datagrams by the kernel": self._receiver.kernel_drops,
             "datagrams of no camera": sum(self._link.rejected.values()),
+            "answers that the network refused": self._receiver.unsent,
         }
 
 

@@ -17,17 +17,19 @@ def assembler(cameras: int, deadline_ms: float = 30.0) -> Assembler:
     return made
 
 
-def frame(camera_id: int) -> RgbdFrame:
-    return RgbdFrame(camera_id=camera_id, sequence=0, timestamp_ns=time.monotonic_ns())
+def frame(camera_id: int, timestamp_ns: int | None = None) -> RgbdFrame:
+    time_ns = time.monotonic_ns() if timestamp_ns is None else timestamp_ns
+    return RgbdFrame(camera_id=camera_id, sequence=0, timestamp_ns=time_ns)
 
 
 def test_whoever_waits_gets_the_set_when_the_last_frame_comes() -> None:
-    sets = assembler(2)
+    sets = assembler(2, deadline_ms=10_000)
+    now_ns = time.monotonic_ns()
     got: list[PanoramicFrame | None] = []
     waiter = threading.Thread(target=lambda: got.append(sets.next_panorama(10.0)))
     waiter.start()
-    sets.add(frame(0))
-    sets.add(frame(1))
+    sets.add(frame(0, now_ns))
+    sets.add(frame(1, now_ns))
     waiter.join(10.0)
     assert got[0] is not None
     assert got[0].complete
@@ -65,3 +67,11 @@ def test_a_camera_that_leaves_releases_the_set_that_waited_for_it() -> None:
     panorama = sets.next_panorama(1.0)
     assert panorama is not None
     assert panorama.missing == (1,)
+
+
+def test_frames_that_enter_no_set_are_counted() -> None:
+    sets = assembler(1)
+    now_ns = time.monotonic_ns()
+    sets.add(frame(0, now_ns + 3600 * 1000 * MS))
+    assert (sets.implausible, sets.skipped) == (1, 0)
+    assert sets.next_panorama(0.0) is None

@@ -98,6 +98,18 @@ def test_waiting_for_cameras_ends_at_once_when_receiving_has_failed(
         rig.wait_for_cameras(timeout_s=60)
 
 
+def test_everything_that_is_lost_on_the_way_has_a_name(rig: Rig) -> None:
+    assert rig.status().dropped == {
+        "sets not taken": 0,
+        "frames left out of sets": 0,
+        "frames of implausible time": 0,
+        "frames not decoded in time": 0,
+        "datagrams by the kernel": 0,
+        "datagrams of no camera": 0,
+        "answers that the network refused": 0,
+    }
+
+
 def test_a_stranger_is_refused_and_the_refusal_is_in_the_message() -> None:
     listed = LOOPBACK.model_copy(
         update={"expected_cameras": None, "cameras": (CameraSettings(id=0, name="door", serial="OTHER"),)}
