@@ -7,11 +7,12 @@ import numpy as np
 import numpy.typing as npt
 
 from rig_calib.bundle_adjustment import AdjustedCamera, Adjustment, adjust
-from rig_calib.depth_model import DepthCorrection
+from rig_calib.depth_model import DepthCorrection, DepthGrid, depth_basis
 from rig_calib.matching import Matches
 from rig_calib.noise import NoiseModel, observed_noise
 from rig_calib.observation_model import CameraState
 from rig_calib.observed_camera import ObservedCamera
+from rig_calib.projection import from_pixels
 from rig_calib.settings import CalibrationSettings
 from rig_calib.tracks import Scene, build_scene, build_tracks
 from rig_calib.uncertainty import PoseCovariance, pose_covariance
@@ -95,8 +96,6 @@ def _adjusted_camera(
     camera: ObservedCamera, start: Pose, ring: RingDrawing | None, fixed: bool, settings: CalibrationSettings
 ) -> AdjustedCamera:
     model = camera.view.model
-    bias_sigma = np.full(settings.bias_terms, settings.bias_shape_sigma)
-    bias_sigma[:1] = settings.bias_scale_sigma
     pose_sigma = None
     if ring is not None:
         pose_sigma = np.repeat([np.deg2rad(ring.tolerance_deg), ring.tolerance_m], 3)
@@ -104,12 +103,21 @@ def _adjusted_camera(
         color=model.color,
         grid=camera.grid,
         start=CameraState(start, np.zeros(settings.bias_terms), np.zeros(3)),
-        bias_sigma=bias_sigma,
+        bias_sigma=_bias_sigma(camera.grid, settings),
         intrinsics_sigma=np.array(_INTRINSICS_SIGMA[model.source]),
         T_prior=None if ring is None else camera.view.T_rig_nominal,
         pose_sigma=pose_sigma,
         fixed_pose=fixed,
     )
+
+
+def _bias_sigma(grid: DepthGrid, settings: CalibrationSettings) -> Array:
+    """Prior standard deviations of the bias terms: the scale's, and shapes of one height over the image."""
+    across = np.linspace(0, grid.intrinsics.width - 1, 3), np.linspace(0, grid.intrinsics.height - 1, 3)
+    x, y = from_pixels(grid.intrinsics, np.stack(np.meshgrid(*across), axis=-1).reshape(-1, 2)).T
+    shapes = depth_basis(x, y, max(settings.bias_terms, 1))[:, 1:]
+    sigma = settings.bias_shape_sigma / np.ptp(shapes, axis=0)
+    return np.concatenate([[settings.bias_scale_sigma], sigma])[: settings.bias_terms]
 
 
 def _correction(state: CameraState) -> DepthCorrection | None:
