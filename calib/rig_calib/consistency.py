@@ -24,7 +24,8 @@ from rig_protocol.poses import Pose, inverse, se3_log
 
 Array = npt.NDArray[np.float64]
 
-_TREES = 60
+_TREES, _SETTLED_TREES = 60, 5
+_WORTH_A_MOVE = 0.1  # of an edge: every move gains that much, so moving ends
 # What an edge's own covariance does not hold (moving cameras, shutter, wrong intrinsics), per axis.
 _FLOOR_DEG, _FLOOR_M = 0.5, 0.015
 # 99.9999 % of a six-dimensional residual: a dropped edge is false, not unlucky.
@@ -108,19 +109,49 @@ def _agree(measured: PoseEdge, drawn: PoseEdge) -> bool:
 def _best_proposal(
     edges: Mapping[tuple[int, int], PoseEdge], group: Sequence[int], drawn: Sequence[PoseEdge], seed: int
 ) -> dict[int, Pose]:
-    """The spanning tree whose poses the most edges agree with."""
+    """Poses that the most edges agree with: the best spanning trees, their misplaced cameras moved."""
     rng = np.random.default_rng(seed)
     listed = list(edges.values())
     cost = np.array([np.trace(np.linalg.inv(edge.information)) for edge in listed])
-    best: dict[int, Pose] = {}
-    best_score = np.inf
-    for trial in range(_TREES):
-        drawn_cost = cost if trial == 0 else rng.exponential(cost)
-        poses = chain_poses(spanning_tree(listed, drawn_cost.tolist()), group[0], np.eye(4))
-        score = _disagreement(listed, poses) + _DRAWING_WEIGHT * _disagreement(drawn, poses)
-        if score < best_score:
-            best, best_score = poses, score
-    return best
+    costs = [cost, *(rng.exponential(cost) for _ in range(_TREES - 1))]
+    trees = [chain_poses(spanning_tree(listed, one.tolist()), group[0], np.eye(4)) for one in costs]
+
+    def score(poses: Mapping[int, Pose]) -> float:
+        return _score(listed, drawn, poses)
+
+    settled = [_settled(poses, listed, drawn) for poses in sorted(trees, key=score)[:_SETTLED_TREES]]
+    best = min(settled, key=score)
+    return {camera_id: inverse(best[group[0]]) @ pose for camera_id, pose in best.items()}
+
+
+def _settled(poses: dict[int, Pose], edges: Sequence[PoseEdge], drawn: Sequence[PoseEdge]) -> dict[int, Pose]:
+    """Move one camera at a time to where one of its edges wants it, as long as more edges agree then.
+
+    A tree hangs a camera on one edge; if that is a false one, the camera's other edges outvote it here.
+    """
+    moved = True
+    while moved:
+        moved = False
+        for camera_id in poses:
+            own = [edge for edge in edges if camera_id in (edge.i, edge.j)]
+            own_drawn = [edge for edge in drawn if camera_id in (edge.i, edge.j)]
+            places = [poses | {camera_id: _place(camera_id, edge, poses)} for edge in own]
+            best = min(places, key=lambda placed: _score(own, own_drawn, placed))  # used at once
+            if _score(own, own_drawn, best) < _score(own, own_drawn, poses) - _WORTH_A_MOVE:
+                poses, moved = best, True
+    return poses
+
+
+def _place(camera_id: int, edge: PoseEdge, poses: Mapping[int, Pose]) -> Pose:
+    """Where an edge says that one of its cameras is, given the other."""
+    if camera_id == edge.j:
+        return np.asarray(poses[edge.i] @ edge.T_i_j)
+    return np.asarray(poses[edge.j] @ inverse(edge.T_i_j))
+
+
+def _score(edges: Sequence[PoseEdge], drawn: Sequence[PoseEdge], poses: Mapping[int, Pose]) -> float:
+    """How many measured edges disagree, and how much of the drawing."""
+    return _disagreement(edges, poses) + _DRAWING_WEIGHT * _disagreement(drawn, poses)
 
 
 def _disagreement(edges: Sequence[PoseEdge], poses: Mapping[int, Pose]) -> float:

@@ -1,7 +1,11 @@
 """Edges judged by each other: false ones are dropped with a reason."""
 
-import numpy as np
+from dataclasses import replace
 
+import numpy as np
+import pytest
+
+from rig_calib import consistency
 from rig_calib.consistency import consistent_graph, unconfirmed
 from rig_calib.edges import Edge
 from rig_protocol.poses import Pose, inverse, se3_exp
@@ -85,3 +89,15 @@ def test_imprecise_edges_that_the_drawing_confirms_are_kept() -> None:
     bias = se3_exp(np.array([np.deg2rad(1.0), 0, 0, 0.02, 0, 0]))
     edges = [edge(i, j, bias) for i, j in RING]
     assert dropped(consistent_graph(edges, range(12), TRUTH, seed=0).edges) == {}
+
+
+def test_edges_that_outnumber_a_false_one_place_their_camera_whatever_tree_starts(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """The only tree that is tried hangs camera 5 on the false edge, which claims to be the best."""
+    monkeypatch.setattr(consistency, "_TREES", 1)
+    chain = [edge(i, i + 1) for i in range(4)] + [edge(i, i + 2) for i in range(3)]
+    confident = replace(edge(4, 5, FALSE), covariance=COVARIANCE / 100)
+    graph = consistent_graph([*chain, confident, edge(3, 5), edge(2, 5)], range(6), {}, seed=0)
+    assert list(dropped(graph.edges)) == [(4, 5)]
+    assert pose_distance(inverse(TRUTH[0]) @ TRUTH[5], graph.poses[5])[0] < 1.5
