@@ -21,6 +21,7 @@ from rig_calib.fusion.surface import Surface
 from rig_calib.fusion.viewpoint import Viewpoint, rig_viewpoint
 from rig_calib.rig_calibration import RigCalibration
 from rig_calib.view import CameraView
+from rig_calib.whole_file import whole_file
 from rig_protocol.camera import Intrinsics
 from rig_protocol.frames import ImageU8
 from rig_protocol.poses import Pose, inverse
@@ -55,9 +56,8 @@ def write_report(
     any frame; without `fused` the page has no panorama and no clouds.
     """
     html = report_html(calibration, views, evidence, poses_before, fused)
-    part = path.with_name(path.name + ".part")
-    part.write_text(html, encoding="utf-8")
-    part.replace(path)
+    with whole_file(path) as file:
+        file.write(html.encode())
 
 
 def report_html(

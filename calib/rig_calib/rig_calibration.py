@@ -10,6 +10,7 @@ import numpy as np
 import numpy.typing as npt
 
 from rig_calib.depth_model import DepthCorrection
+from rig_calib.whole_file import whole_file
 from rig_protocol.camera import as_pose
 from rig_protocol.errors import DataError
 from rig_protocol.poses import Pose
@@ -193,9 +194,8 @@ class RigCalibration:
 
     def save(self, path: Path) -> None:
         """Write the file whole or not at all."""
-        part = path.with_name(path.name + ".part")
-        part.write_text(json.dumps(self.to_dict(), indent=1) + "\n")
-        part.replace(path)
+        with whole_file(path) as file:
+            file.write(json.dumps(self.to_dict(), indent=1).encode() + b"\n")
 
     @classmethod
     def load(cls, path: Path) -> "RigCalibration":

@@ -7,6 +7,7 @@ import numpy as np
 import numpy.typing as npt
 
 from rig_calib.fusion.panorama import Panorama
+from rig_calib.whole_file import whole_file
 from rig_protocol.errors import DataError
 from rig_protocol.frames import ImageU8
 
@@ -22,9 +23,8 @@ def write_panorama(path: Path, panorama: Panorama) -> None:
     written, data = cv2.imencode(".png", panorama_picture(panorama))
     if not written:
         raise DataError(f"{path}: the panorama could not be encoded as PNG")
-    part = path.with_name(path.name + ".part")
-    part.write_bytes(data.tobytes())
-    part.replace(path)
+    with whole_file(path) as file:
+        file.write(data.tobytes())
 
 
 def panorama_picture(panorama: Panorama) -> ImageU8:

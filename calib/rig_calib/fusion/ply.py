@@ -9,6 +9,7 @@ from typing import BinaryIO
 import numpy as np
 
 from rig_calib.fusion.cloud import PointCloud
+from rig_calib.whole_file import whole_file
 from rig_protocol.errors import ConfigurationError, DataError
 
 _WRITTEN = np.dtype(
@@ -32,13 +33,11 @@ _CHUNK_POINTS = 1 << 20  # rows that are interleaved at once: 15 MB beside the c
 
 def write_ply(path: Path, cloud: PointCloud) -> None:
     """Write the cloud, the file whole or not at all; vertices hold x y z float, red green blue uchar."""
-    part = path.with_name(path.name + ".part")
-    with part.open("wb") as file:
+    with whole_file(path) as file:
         file.write(_header(len(cloud)))
         for start in range(0, len(cloud), _CHUNK_POINTS):
             rows = slice(start, start + _CHUNK_POINTS)
             file.write(_interleave(cloud, rows).tobytes())
-    part.replace(path)
 
 
 def read_ply(path: Path) -> PointCloud:
