@@ -1,6 +1,5 @@
 """The command line of rig-server: what it writes, what it refuses, how it ends."""
 
-import logging
 import os
 import signal
 import socket
@@ -21,8 +20,7 @@ Program = Callable[..., int]
 def rig_server(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Program]:
     """Run the program in this process, in an empty folder; its exit status."""
     monkeypatch.chdir(tmp_path)
-    handler, root = signal.getsignal(signal.SIGTERM), logging.getLogger()
-    log_handlers, log_level = list(root.handlers), root.level
+    handler = signal.getsignal(signal.SIGTERM)
 
     def run(*words: str) -> int:
         monkeypatch.setattr(sys, "argv", ["rig-server", *words])
@@ -32,8 +30,6 @@ def rig_server(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Prog
 
     yield run
     signal.signal(signal.SIGTERM, handler)
-    root.handlers[:] = log_handlers
-    root.setLevel(log_level)
 
 
 def test_init_writes_a_file_that_changes_nothing_and_overwrites_only_by_force(
