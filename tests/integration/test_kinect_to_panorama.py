@@ -63,6 +63,8 @@ def test_recorded_frames_arrive_byte_exact_at_30_fps(kinect: VirtualKinect, port
             if gapless := is_gapless(panoramas):
                 break
         assert gapless, rig.status()
+        # The host may be late at the bus; what was captured and sent arrives, all of it.
+        assert sum(camera.lost for camera in rig.status().cameras) == 0
     elapsed_s = (panoramas[-1].timestamp_ns - panoramas[0].timestamp_ns) / 1e9
     assert (RATE_WINDOW - 1) / elapsed_s == pytest.approx(30.0, abs=0.3)
     assert kinect.log()
