@@ -30,6 +30,7 @@ class RgbdFrame:
 
     Colour is either `bayer` (H,W) u8, GRBG, or `color` (H,W,3) BGR or (H,W) grey u8.
     Depth is either `raw` (H,W) u16 11-bit disparity, 2047 = none, or `depth_mm` (H,W) u16, 0 = none.
+    `received_ns`: rig time at which its last datagram was here; None where it crossed no network.
     """
 
     camera_id: int
@@ -42,6 +43,7 @@ class RgbdFrame:
     depth_mm: ImageU16 | None = None
     depth_frame: DepthFrame = "depth"
     damaged: bool = False
+    received_ns: int | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -56,7 +58,8 @@ class Payload:
 class EncodedFrame:
     """An RgbdFrame as it crosses the wire; either payload may be absent.
 
-    `timestamp_ns` is agent time on the agent and rig time once the server's link has delivered the frame.
+    `timestamp_ns` is agent time on the agent and rig time once the server's link has delivered the frame;
+    from then on `received_ns` is the rig time at which its last datagram was here.
     """
 
     camera_id: int
@@ -67,6 +70,7 @@ class EncodedFrame:
     depth: Payload | None = None
     depth_frame: DepthFrame = "depth"
     damaged: bool = False
+    received_ns: int | None = None
 
 
 @dataclass(frozen=True, slots=True)

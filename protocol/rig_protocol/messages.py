@@ -66,6 +66,21 @@ class Reject:
 
 
 @dataclass(frozen=True, slots=True)
+class StreamPlan:
+    """What an agent is to send from now on, and when: the server's share of the link for one camera.
+
+    At most `fps` frames a second. Bursts of datagrams leave at agent times that are `phase_ns` modulo
+    `step_ns`, so that those of different agents meet the switch one after another.
+    """
+
+    color_codec: int | None
+    depth_codec: int | None
+    fps: float
+    step_ns: int
+    phase_ns: int
+
+
+@dataclass(frozen=True, slots=True)
 class Goodbye:
     """The sender ends the session; `text` says why."""
 

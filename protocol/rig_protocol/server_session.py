@@ -116,4 +116,4 @@ class ServerSession:
             self._clock.hurry()
             return None
         total_ns = ceil(hypot(uncertainty_ns, frame.uncertainty_ns))
-        return replace(frame, timestamp_ns=timestamp_ns, uncertainty_ns=total_ns)
+        return replace(frame, timestamp_ns=timestamp_ns, uncertainty_ns=total_ns, received_ns=now_ns)

@@ -26,6 +26,7 @@ def decode_frame(frame: EncodedFrame) -> RgbdFrame:
         uncertainty_ns=frame.uncertainty_ns,
         depth_frame=frame.depth_frame,
         damaged=frame.damaged,
+        received_ns=frame.received_ns,
         **images,
     )
 
