@@ -20,10 +20,11 @@ from rig_agent.health import HealthLog, Totals, gauges
 from rig_agent.hello import make_hello
 from rig_agent.sources.base import FrameSource, SourceDescription
 from rig_agent.transport import now_ns
-from rig_agent.uplink import Uplink
+from rig_agent.uplink import Uplink, Wanted
 from rig_protocol.errors import RigError
 from rig_protocol.frames import EncodedFrame, RgbdFrame
-from rig_protocol.messages import Hello, Welcome
+from rig_protocol.messages import Hello
+from rig_protocol.rig_key import RigKey
 
 _log = logging.getLogger(__name__)
 
@@ -37,7 +38,9 @@ _STOP_TIMEOUT_S = 5.0  # closing a Kinect takes a few seconds at most
 class Agent:
     """Streams one camera to one server until it is told to stop, whatever fails in between."""
 
-    def __init__(self, settings: AgentSettings, open_source: Callable[[], FrameSource]) -> None:
+    def __init__(
+        self, settings: AgentSettings, rig_key: RigKey, open_source: Callable[[], FrameSource]
+    ) -> None:
         """Nothing runs before `run`."""
         self._settings = settings
         self._captured: FrameQueue[RgbdFrame] = FrameQueue(_QUEUE_FRAMES)
@@ -46,10 +49,10 @@ class Agent:
             open_source, settings.fps, self._source_opened, self._captured.put, self._fail
         )
         self._encoder = threading.Thread(target=self._encode_frames, name="encoder", daemon=True)
-        self._uplink = Uplink(settings)
+        self._uplink = Uplink(settings, rig_key)
         self._hello: Hello | None = None  # of the source that is open now
         self._introduced: Hello | None = None
-        self._welcome: Welcome | None = None  # what the encoder encodes for; None: nobody listens
+        self._wanted: Wanted | None = None  # what the encoder encodes for; None: nobody listens
         self._unheard = 0
         self._failure: Exception | None = None
         self._stopping = threading.Event()
@@ -65,6 +68,7 @@ class Agent:
             dropped=self._captured.dropped + self._encoded.dropped + uplink.dropped,
             unheard=self._unheard + uplink.unheard,
             damaged=capture.damaged,
+            resent=uplink.resent,
             connections=uplink.connections,
             source_losses=capture.losses,
             network_errors=uplink.network_errors,
@@ -106,7 +110,7 @@ class Agent:
                 gauges_due_ns = time_ns + _GAUGES_INTERVAL_NS
                 self._uplink.report_health(gauges(self.totals))
             if time_ns >= health.due_ns:
-                _log.info("%s", health.line(self.totals, self._welcome is not None, time_ns))
+                _log.info("%s", health.line(self.totals, self._wanted is not None, time_ns))
             if time_ns - self._capture.last_sign_ns > _HUNG_NS:
                 raise RigError(f"the {self._settings.source} driver hangs: start the agent anew")
 
@@ -126,7 +130,8 @@ class Agent:
             self._uplink.introduce(hello, time_ns)
         # Control first: cutting a frame takes a millisecond, which the clock exchange would feel.
         self._uplink.serve(time_ns)
-        self._welcome = self._uplink.welcome
+        self._wanted = self._uplink.wanted
+        self._capture.wanted_fps = None if self._wanted is None else self._wanted.fps
         while (frame := self._encoded.get()) is not None:
             self._uplink.send_frame(frame, time_ns)
 
@@ -146,14 +151,14 @@ class Agent:
     def _encode_frames(self) -> None:
         try:
             while not self._stopping.is_set():
-                frame, welcome = self._captured.get(_TICK_S), self._welcome
+                frame, wanted = self._captured.get(_TICK_S), self._wanted
                 if frame is None:
                     continue
-                if welcome is None:
+                if wanted is None:
                     self._unheard += 1
                     continue
-                named = replace(frame, camera_id=welcome.camera_id)
-                self._encoded.put(encode_frame(named, welcome.color_codec, welcome.depth_codec))
+                named = replace(frame, camera_id=wanted.camera_id)
+                self._encoded.put(encode_frame(named, wanted.color_codec, wanted.depth_codec))
                 self._wake_up()
         except Exception as error:  # the thread's boundary: `run` raises it
             self._fail(error)

@@ -44,6 +44,7 @@ class Capture:
         """Frames beyond `max_fps` are left out evenly."""
         self._open_source = open_source
         self._max_fps = max_fps
+        self.wanted_fps: float | None = None  # what the server wants; set from any thread
         self._on_open, self._on_frame, self._on_failure = on_open, on_frame, on_failure
         self._stopping = threading.Event()
         # A daemon: a driver that hangs must not keep the program from ending.
@@ -89,7 +90,7 @@ class Capture:
         with self._open_source() as source:
             description = source.describe()
             self._on_open(description)
-            wanted = _Thinning(description.fps, self._max_fps)
+            wanted = _Thinning(description.fps)
             offset: int | None = None
             counted_before = Counter(self.source_counters)
             while not self._stopping.is_set():
@@ -100,10 +101,13 @@ class Capture:
                     continue
                 if offset is None:  # a source that was opened again counts on where the last one ended
                     offset = self._next_sequence - frame.sequence
-                if wanted.accepts(frame.timestamp_ns):
+                if wanted.accepts(frame.timestamp_ns, self._limit_fps(description.fps)):
                     self._deliver(replace(frame, sequence=frame.sequence + offset))
                 else:  # left out on purpose: no gap in the count, which tells of frames that were lost
                     offset -= 1
+
+    def _limit_fps(self, source_fps: float) -> float:
+        return min(self._max_fps or source_fps, self.wanted_fps or source_fps)
 
     def _deliver(self, frame: RgbdFrame) -> None:
         self._next_sequence = frame.sequence + 1
@@ -115,19 +119,19 @@ class Capture:
 class _Thinning:
     """Lets every frame of a source pass that is no faster than wanted, else the nearest to an even rate."""
 
-    def __init__(self, source_fps: float, max_fps: float | None) -> None:
-        self._active = max_fps is not None and max_fps < source_fps
-        self._interval_ns = 1e9 / (max_fps or source_fps)
+    def __init__(self, source_fps: float) -> None:
+        self._source_fps = source_fps
         self._half_source_ns = 0.5e9 / source_fps
         self._due_ns: float | None = None
 
-    def accepts(self, timestamp_ns: int) -> bool:
-        """True for a frame that is due."""
-        if not self._active:
+    def accepts(self, timestamp_ns: int, max_fps: float) -> bool:
+        """True for a frame that is due at a rate of at most `max_fps`."""
+        if max_fps >= self._source_fps:
             return True
-        if self._due_ns is None or timestamp_ns - self._due_ns > self._interval_ns:
+        interval_ns = 1e9 / max_fps
+        if self._due_ns is None or abs(timestamp_ns - self._due_ns) > interval_ns:
             self._due_ns = timestamp_ns
         if timestamp_ns < self._due_ns - self._half_source_ns:
             return False
-        self._due_ns += self._interval_ns
+        self._due_ns += interval_ns
         return True

@@ -64,6 +64,12 @@ def run(
         Path | None,
         typer.Option(metavar="FILE", help="Write the true poses of the simulated ring (source synthetic)."),
     ] = None,
+    key_file: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="The rig's key (rig-server keygen makes it).")
+    ] = None,
+    insecure: Annotated[
+        bool, typer.Option("--insecure", help="Anybody may listen and join: only on an isolated bench.")
+    ] = False,
     print_config: Annotated[
         bool, typer.Option("--print-config", help="Print the effective settings as TOML and exit.")
     ] = False,
@@ -84,6 +90,8 @@ def run(
         "source": source,
         "camera": slot,
         "fps": fps,
+        "key_file": key_file,
+        "insecure": insecure or None,
         "folder": {"path": path, "camera": name},
         "synthetic": {"seed": seed, "cameras": cameras},
     }
@@ -123,8 +131,9 @@ def main() -> None:
 def _stream(settings: "AgentSettings") -> None:
     from rig_agent.agent import Agent
     from rig_agent.sources import open_source
+    from rig_protocol.key_file import rig_key
 
-    agent = Agent(settings, lambda: open_source(settings))
+    agent = Agent(settings, rig_key(settings.key_file, settings.insecure), lambda: open_source(settings))
 
     def stop(*_: object) -> None:
         _on_signals(signal.SIG_DFL)  # a second Ctrl-C ends the program without ceremony

@@ -61,6 +61,10 @@ class AgentSettings(Settings):
     """Largest UDP payload in bytes: the path's MTU minus 28 (jumbo frames: 8972)."""
     report_interval_s: float = Field(60.0, ge=1, le=3600)
     """How often one line in the log tells rates, drops and reconnects."""
+    key_file: Path | None = Field(None, examples=[Path("/etc/kinect-rig/rig.key")])
+    """The rig's key, as `rig-server keygen` made it; unset: ./rig.key, else /etc/kinect-rig/rig.key."""
+    insecure: bool = False
+    """Neither authenticate nor keep secret: only for an isolated bench."""
     log_level: Literal["DEBUG", "INFO", "WARNING", "ERROR"] = "INFO"
     """What is worth a line in the log."""
     pacing: PacingSettings = PacingSettings()

@@ -17,6 +17,8 @@ class Totals:
     """Frames whose every datagram was handed to the network."""
     dropped: int = 0
     """Frames given up for newer ones, before or after encoding, or while being sent."""
+    resent: int = 0
+    """Datagrams that the server missed and got again."""
     unheard: int = 0
     """Frames captured while no server listened."""
     damaged: int = 0
@@ -35,6 +37,7 @@ def gauges(totals: Totals) -> dict[str, float]:
     """What the server's operator may want to see of this agent, by name."""
     found: dict[str, float] = {
         "dropped": totals.dropped,
+        "resent": totals.resent,
         "damaged": totals.damaged,
         "source_losses": totals.source_losses,
         **{f"source_{name}": count for name, count in totals.source.items()},
@@ -70,6 +73,7 @@ class HealthLog:
             f"{'connected' if connected else 'not connected'}: "
             f"captured {captured / seconds:.1f} fps, sent {sent / seconds:.1f} fps; in total "
             f"{totals.sent} sent, {totals.dropped} dropped, {totals.unheard} unheard, "
+            f"{totals.resent} resent, "
             f"{totals.damaged} damaged, {totals.connections} connections, "
             f"{totals.source_losses} device losses, {totals.network_errors} network errors{source}"
         )

@@ -1,9 +1,11 @@
 """Spreads each frame's datagrams over most of the frame interval, in small bursts.
 
-Twelve agents that each send a frame at once overflow the switch port of the server (incast). No clock
-here: the caller gives the time and sends what `next_burst` returns.
+Twelve agents that each send a frame at once overflow the switch port of the server (incast). Where the
+server has a plan, bursts leave on its grid, where each agent has a place of its own. No clock here: the
+caller gives the time and sends what `next_burst` and `next_resend` return.
 """
 
+from collections import deque
 from dataclasses import dataclass
 
 from rig_protocol.datagram import DatagramBatch
@@ -12,6 +14,20 @@ from rig_protocol.datagram import DatagramBatch
 _CATCH_UP = 4
 # A frame still unsent after this many intervals is given up for a newer one: the server gave it up, too.
 _STALE_INTERVALS = 2
+# Answers to requests: the budget of the link holds three frames, in at most as many pieces as a frame has.
+_MAX_RESENDS = 512
+
+
+@dataclass(frozen=True, slots=True)
+class BurstGrid:
+    """Moments at which bursts leave: agent times that are `phase_ns` modulo `step_ns`."""
+
+    step_ns: int
+    phase_ns: int
+
+    def next_ns(self, now_ns: int) -> int:
+        """The first moment from `now_ns` on."""
+        return now_ns + (self.phase_ns - now_ns) % self.step_ns
 
 
 @dataclass(slots=True)
@@ -23,33 +39,43 @@ class PacerCounters:
 
 
 class Pacer:
-    """Holds at most two frames: the one that is being sent and the newest one after it."""
+    """Holds at most two frames, the one that is being sent and the newest one after it, and resends."""
 
     def __init__(self, interval_ns: int, spread: float, burst: int) -> None:
         """`spread` is the share of the frame interval to send over, `burst` the datagrams sent at once."""
         self.interval_ns = interval_ns
+        self.grid: BurstGrid | None = None
+        self.counters = PacerCounters()
         self._spread = spread
-        self._burst = burst
+        self._default_burst = self._burst = burst
         self._current: DatagramBatch | None = None
         self._waiting: DatagramBatch | None = None
         self._position = 0
         self._started_ns = 0
         self._step_ns = 0
         self._due_ns = 0
-        self.counters = PacerCounters()
+        self._resends: deque[DatagramBatch] = deque(maxlen=_MAX_RESENDS)
+        self._resend_due_ns = 0
 
-    def submit(self, batch: DatagramBatch, now_ns: int) -> None:
-        """Take a frame to send; an older one that has not begun, or has become stale, is dropped."""
+    def submit(self, batch: DatagramBatch, now_ns: int) -> list[DatagramBatch]:
+        """Take a frame to send; those given up for it: one that has not begun, or has become stale."""
         if self._current is None:
             self._start(batch, now_ns)
-            return
-        if self._waiting is not None:
-            self.counters.dropped += 1
+            return []
+        given_up = [] if self._waiting is None else [self._waiting]
         self._waiting = batch
         stale = now_ns - self._started_ns > _STALE_INTERVALS * self.interval_ns
         if self._position == 0 or stale:
-            self.counters.dropped += 1
+            given_up.append(self._current)
             self._advance(now_ns)
+        self.counters.dropped += len(given_up)
+        return given_up
+
+    def sent_of(self, batch: DatagramBatch) -> int:
+        """How many datagrams of a frame have left so far."""
+        if batch is self._current:
+            return self._position
+        return 0 if batch is self._waiting else len(batch)
 
     def next_burst(self, now_ns: int) -> DatagramBatch | None:
         """The datagrams that are due, or None; tell `sent` how many of them went out."""
@@ -71,14 +97,34 @@ class Pacer:
         planned_ns = self._started_ns + self._position // self._burst * self._step_ns
         self._due_ns = max(planned_ns, now_ns + self._step_ns // 2)
 
+    def resend(self, batch: DatagramBatch) -> None:
+        """Take datagrams to send again, ahead of the frame's own; the oldest of too many are dropped."""
+        self._resends.append(batch)
+
+    def next_resend(self, now_ns: int) -> DatagramBatch | None:
+        """Datagrams to send again now, at most one burst a step, or None."""
+        if not self._resends or now_ns < self._resend_due_ns:
+            return None
+        batch = self._resends.popleft()
+        if len(batch) > self._burst:
+            rest = DatagramBatch(batch.part(self._burst, len(batch)), batch.segment_size)
+            self._resends.appendleft(rest)
+            batch = DatagramBatch(batch.part(0, self._burst), batch.segment_size)
+        self._resend_due_ns = now_ns + self._step_ns * len(batch) // self._burst
+        return batch
+
     def next_timeout_ns(self) -> int | None:
         """When the next burst is due; None when there is nothing to send."""
-        return None if self._current is None else self._due_ns
+        dues = [] if self._current is None else [self._due_ns]
+        if self._resends:
+            dues.append(self._resend_due_ns)
+        return min(dues, default=None)
 
     def clear(self) -> None:
         """Drop what is unsent, because nobody listens any more."""
         self.counters.dropped += (self._current is not None) + (self._waiting is not None)
         self._current = self._waiting = None
+        self._resends.clear()
 
     def _advance(self, now_ns: int) -> None:
         following, self._waiting, self._current = self._waiting, None, None
@@ -86,7 +132,13 @@ class Pacer:
             self._start(following, now_ns)
 
     def _start(self, batch: DatagramBatch, now_ns: int) -> None:
-        bursts = max(1, -(-len(batch) // self._burst))
         self._current, self._position = batch, 0
+        if self.grid is not None and self._spread > 0:
+            steps = max(1, int(self.interval_ns * self._spread / self.grid.step_ns))
+            self._step_ns, self._burst = self.grid.step_ns, -(-len(batch) // steps)
+            self._started_ns = self._due_ns = self.grid.next_ns(now_ns)
+            return
+        self._burst = self._default_burst
+        bursts = max(1, -(-len(batch) // self._burst))
         self._started_ns = self._due_ns = now_ns
         self._step_ns = max(1, round(self.interval_ns * self._spread / bursts))

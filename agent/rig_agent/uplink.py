@@ -2,15 +2,18 @@
 
 import logging
 import secrets
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 
 from rig_agent.config import AgentSettings
-from rig_agent.pacer import Pacer
+from rig_agent.pacer import BurstGrid, Pacer
 from rig_agent.transport import Transport
 from rig_protocol.agent_link import AgentLink
 from rig_protocol.events import AgentEvent, Connected, Disconnected, Rejected
 from rig_protocol.frames import EncodedFrame
-from rig_protocol.messages import Hello, Welcome
+from rig_protocol.messages import Hello, StreamPlan, Welcome
+from rig_protocol.rig_key import RigKey
+from rig_protocol.system_clock import SystemClockReading
 
 _log = logging.getLogger(__name__)
 
@@ -20,16 +23,35 @@ _NO_NETWORK_RETRY_NS = 1_000_000_000
 _ONE_FRAME_NS = 33_333_333
 
 
+@dataclass(frozen=True, slots=True)
+class Wanted:
+    """What the server wants of this camera: codecs (None: not this stream), at most `fps` frames a second."""
+
+    camera_id: int
+    color_codec: int | None
+    depth_codec: int | None
+    fps: float | None
+
+
 class Uplink:
     """Sends frames to one server whenever it listens. One thread; the caller gives the time."""
 
-    def __init__(self, settings: AgentSettings) -> None:
+    def __init__(
+        self,
+        settings: AgentSettings,
+        rig_key: RigKey,
+        read_system_clock: Callable[[], SystemClockReading] | None = None,
+    ) -> None:
         """Silent until `introduce`."""
         self._server = settings.server
+        self._rig_key = rig_key
+        self._read_system_clock = read_system_clock
         self._datagram_size = settings.datagram_size
         self._transport = Transport(settings.address)
         self._pacer = Pacer(_ONE_FRAME_NS, settings.pacing.spread, settings.pacing.burst)
         self._link: AgentLink | None = None
+        self._plan: StreamPlan | None = None
+        self._full_interval_ns = _ONE_FRAME_NS
         self._reopen_ns = 0
         self._refusal = ""
         self.connections = 0
@@ -39,6 +61,18 @@ class Uplink:
     def welcome(self) -> Welcome | None:
         """The server's choices while it listens, else None."""
         return None if self._link is None else self._link.session
+
+    @property
+    def wanted(self) -> Wanted | None:
+        """What to send now while the server listens, else None."""
+        welcome = self.welcome
+        if self._link is None or welcome is None:
+            return None
+        plan = self._link.plan
+        if plan is None:
+            color, depth = _first(welcome.color_codecs), _first(welcome.depth_codecs)
+            return Wanted(welcome.camera_id, color, depth, None)
+        return Wanted(welcome.camera_id, plan.color_codec, plan.depth_codec, plan.fps)
 
     @property
     def sent(self) -> int:
@@ -51,6 +85,11 @@ class Uplink:
         return self._pacer.counters.dropped
 
     @property
+    def resent(self) -> int:
+        """Datagrams that the server asked for again."""
+        return 0 if self._link is None else self._link.counters.resent
+
+    @property
     def network_errors(self) -> int:
         """Sends that the network refused."""
         return self._transport.counters.network_errors
@@ -58,8 +97,8 @@ class Uplink:
     def introduce(self, hello: Hello, now_ns: int) -> None:
         """Say hello as this camera from now on; a session of another camera ends."""
         self._say_goodbye(now_ns)
-        self._pacer.interval_ns = round(1e9 / hello.fps)
-        self._link = AgentLink(hello, self._datagram_size, nonce_source=lambda: secrets.randbits(64))
+        self._full_interval_ns = self._pacer.interval_ns = round(1e9 / hello.fps)
+        self._link = AgentLink(hello, self._rig_key, secrets.token_bytes, self._datagram_size)
 
     def report_health(self, gauges: Mapping[str, float]) -> None:
         """What the next heartbeats tell the server."""
@@ -73,10 +112,11 @@ class Uplink:
     def send_frame(self, frame: EncodedFrame, now_ns: int) -> None:
         """Queue a frame for sending; dropped, and counted in `unheard`, while nobody listens."""
         batch = None if self._link is None else self._link.send_frame(frame, now_ns)
-        if batch is None:
+        if self._link is None or batch is None:
             self.unheard += 1
-        else:
-            self._pacer.submit(batch, now_ns)
+            return
+        for given_up in self._pacer.submit(batch, now_ns):
+            self._link.give_up_frame(given_up)
 
     def serve(self, now_ns: int) -> None:
         """Receive what came, do what is due, send what is due."""
@@ -91,11 +131,9 @@ class Uplink:
             self._report(event)
         if not self._link.connected and now_ns >= self._reopen_ns:
             self._reopen_ns = now_ns + (_REOPEN_NS if self._transport.open() else _NO_NETWORK_RETRY_NS)
-        for datagram in self._link.datagrams_to_send(now_ns):
-            self._transport.send_datagram(datagram)
-        burst = self._pacer.next_burst(now_ns)
-        if burst is not None:
-            self._pacer.sent(self._transport.send(burst), now_ns)
+        self._send_control(self._link, now_ns)
+        self._follow_plan(self._link.plan)
+        self._send_frames(self._link, now_ns)
 
     def next_timeout_ns(self) -> int | None:
         """When `serve` is due again, if nothing arrives before."""
@@ -109,6 +147,29 @@ class Uplink:
         """Say goodbye and close the socket."""
         self._say_goodbye(now_ns)
         self._transport.close()
+
+    def _send_control(self, link: AgentLink, now_ns: int) -> None:
+        system_clock = self._read_system_clock() if link.answers_clock and self._read_system_clock else None
+        for datagram in link.datagrams_to_send(now_ns, system_clock):
+            self._transport.send_datagram(datagram)
+
+    def _send_frames(self, link: AgentLink, now_ns: int) -> None:
+        for batch in link.frames_to_resend(self._pacer.sent_of):
+            self._pacer.resend(batch)
+        while (again := self._pacer.next_resend(now_ns)) is not None:
+            self._transport.send(again)
+        burst = self._pacer.next_burst(now_ns)
+        if burst is not None:
+            self._pacer.sent(self._transport.send(burst), now_ns)
+
+    def _follow_plan(self, plan: StreamPlan | None) -> None:
+        """Pace as the server wants from the next frame on."""
+        if plan is self._plan:
+            return
+        self._plan = plan
+        self._pacer.grid = None if plan is None else BurstGrid(plan.step_ns, plan.phase_ns)
+        planned_ns = 0 if plan is None else round(1e9 / plan.fps)
+        self._pacer.interval_ns = max(self._full_interval_ns, planned_ns)
 
     def _say_goodbye(self, now_ns: int) -> None:
         self._pacer.clear()
@@ -134,3 +195,7 @@ class Uplink:
             case Disconnected(text):
                 self._pacer.clear()
                 _log.warning("lost %s: %s; trying on", self._server, text)
+
+
+def _first(codecs: tuple[int, ...]) -> int | None:
+    return codecs[0] if codecs else None

@@ -12,7 +12,7 @@ from rig_protocol.server_session import CameraStatus, ServerSession
 # A holder that missed a heartbeat and two clock replies in a row gives way to another agent.
 HOLDER_LIVE_NS = 750_000_000
 
-Codecs = tuple[int | None, int | None]
+Codecs = tuple[tuple[int, ...], tuple[int, ...]]
 
 
 def same_agent(status: CameraStatus, hello: Hello, address: Address) -> bool:
@@ -27,7 +27,7 @@ def gives_way(holder: ServerSession, hello: Hello, address: Address, now_ns: int
 
 
 def choose_codecs(hello: Hello, color_codecs: Sequence[int], depth_codecs: Sequence[int]) -> Codecs | Reject:
-    """For each stream the first codec in the agent's order that the server takes; None for no such stream."""
+    """For each stream the codecs that the server takes, in the agent's order; none for no such stream."""
     chosen = []
     for stream, offered, accepted in (
         ("colour", hello.color_codecs, color_codecs),
@@ -40,7 +40,7 @@ def choose_codecs(hello: Hello, color_codecs: Sequence[int], depth_codecs: Seque
                 f"{describe(hello)} offers {stream} codecs {_listed(offered)}, "
                 f"this server takes {_listed(accepted)}: install the same release on both",
             )
-        chosen.append(common[0] if common else None)
+        chosen.append(tuple(common))
     return chosen[0], chosen[1]
 
 
@@ -62,6 +62,16 @@ def version_mismatch(theirs: int) -> Reject:
         f"the agent speaks protocol version {theirs}, this server speaks {VERSION}: "
         "install the same release on both",
     )
+
+
+def wrong_key(server_is_insecure: bool) -> Reject:
+    """The answer to an agent that does not hold this rig's key."""
+    advice = (
+        "this server runs with --insecure, the agent does not"
+        if server_is_insecure
+        else "copy the server's key file to the agent's machine, and start neither with --insecure"
+    )
+    return Reject(RejectReason.WRONG_KEY, f"the agent holds another key than this rig: {advice}")
 
 
 def malformed_hello(error: DataError) -> Reject:

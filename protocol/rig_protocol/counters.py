@@ -25,12 +25,17 @@ class CameraCounters:
     unexpected_codec: int = 0
     untimed: int = 0
     overflow: int = 0
+    # fragments that were asked for again, and those of them that then came
+    requested: int = 0
+    resent: int = 0
     # datagrams dropped
     late: int = 0
     duplicate: int = 0
     oversized: int = 0
     bad_fragment: int = 0
     bad_clock_reply: int = 0
+    bad_seal: int = 0
+    replayed: int = 0
     clock_steps: int = 0
 
     @property
@@ -60,5 +65,8 @@ class AgentCounters:
     bytes: int = 0
     not_connected: int = 0
     unexpected_codec: int = 0
+    # fragments that the server asked for again: sent, and refused (no longer held, or over the budget)
+    resent: int = 0
+    resend_refused: int = 0
     # received datagrams that were dropped, by cause
     rejected: Counter[str] = field(default_factory=Counter)

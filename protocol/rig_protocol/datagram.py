@@ -18,7 +18,7 @@ from rig_protocol.errors import LinkUsageError
 Buffer = bytes | bytearray | memoryview
 
 MAGIC = b"KR"
-VERSION = 1
+VERSION = 2
 
 # 1500 (Ethernet) - 20 (IPv4) - 8 (UDP).
 DEFAULT_DATAGRAM_SIZE = 1472
@@ -37,7 +37,7 @@ FRAGMENT_HEADER = np.dtype(
         ("magic", "S2"),
         ("version", "u1"),
         ("type", "u1"),
-        ("frame_crc", "<u4"),
+        ("seal", "<u4"),
         ("session_id", "<u8"),
         ("frame_number", "<u8"),
         ("unit_size", "<u4"),
@@ -65,6 +65,8 @@ class MessageType(IntEnum):
     CLOCK_REQUEST = 6
     CLOCK_REPLY = 7
     UNKNOWN_SESSION = 8
+    RESEND = 9
+    PLAN = 10
     FRAGMENT = 16
 
 
@@ -82,9 +84,12 @@ class Prefix(NamedTuple):
 
 
 class FragmentHeader(NamedTuple):
-    """What a fragment says of itself; `payload_size` is that of every fragment but the last."""
+    """What a fragment says of itself; `payload_size` is that of every fragment but the last.
 
-    frame_crc: int
+    `seal` is the start of the unit's authentication tag: it tells units apart before one is whole.
+    """
+
+    seal: int
     session_id: int
     frame_number: int
     unit_size: int

@@ -1,4 +1,4 @@
-"""A frame into datagrams: all of them in a few NumPy operations."""
+"""A frame into sealed datagrams: all of them in a few NumPy operations."""
 
 import numpy as np
 
@@ -11,8 +11,9 @@ from rig_protocol.datagram import (
     write_fragment_headers,
 )
 from rig_protocol.errors import LinkUsageError
-from rig_protocol.frame_unit import MAX_UNIT_SIZE, frame_crc, pack_unit
+from rig_protocol.frame_unit import MAX_SEALED_SIZE, leading_seal, pack_unit, sealed_place
 from rig_protocol.frames import EncodedFrame
+from rig_protocol.security import TAG_SIZE, FrameSeal
 
 _MAX_FRAGMENTS = 2**16
 
@@ -20,25 +21,26 @@ _MAX_FRAGMENTS = 2**16
 def fragment(
     frame: EncodedFrame,
     session_id: int,
+    frame_number: int,
+    seal: FrameSeal,
     datagram_size: int = DEFAULT_DATAGRAM_SIZE,
-    frame_number: int | None = None,
 ) -> DatagramBatch:
     """The datagrams of a frame, none longer than `datagram_size`; only the last may be shorter.
 
-    `frame_number` counts the frames of the session; the frame's own sequence stands in where none is
-    given. LinkUsageError for a frame or a size that the protocol does not allow.
+    `frame_number` counts the frames of the session: each is sealed once. LinkUsageError for a frame or a
+    size that the protocol does not allow.
     """
     payload_size = datagram_size - FRAGMENT_HEADER_SIZE
     if (
         not payload_size > 0
         or datagram_size > MAX_DATAGRAM_SIZE
-        or payload_size * _MAX_FRAGMENTS < MAX_UNIT_SIZE
+        or payload_size * _MAX_FRAGMENTS < MAX_SEALED_SIZE
     ):
         raise LinkUsageError(f"datagrams of {datagram_size} bytes cannot carry every frame")
     unit = pack_unit(frame)
-    number = frame.sequence if frame_number is None else frame_number
-    place = FragmentHeader(0, session_id, number, len(unit), payload_size, 0)
-    return _cut(unit, place._replace(frame_crc=frame_crc(unit, place)))
+    place = FragmentHeader(0, session_id, frame_number, len(unit) + TAG_SIZE, payload_size, 0)
+    sealed = seal.seal(frame_number, unit, sealed_place(place))
+    return _cut(sealed, place._replace(seal=leading_seal(sealed)))
 
 
 def _cut(unit: bytes, first: FragmentHeader) -> DatagramBatch:

@@ -1,23 +1,26 @@
 """A frame as one unit of bytes: frame header, colour payload, depth payload (protocol/SPEC.md, section 3)."""
 
 import struct
-import zlib
 
 from rig_protocol.datagram import Buffer, FragmentHeader
 from rig_protocol.errors import DataError, LinkUsageError
 from rig_protocol.frames import EncodedFrame, Payload
+from rig_protocol.security import TAG_SIZE
 
 _HEADER = struct.Struct("<QqIBBBxII")
 FRAME_HEADER_SIZE = _HEADER.size
 
 # 1280×1024 Bayer and raw 16-bit depth, unencoded, are 1.9 MB.
 MAX_UNIT_SIZE = 2 * 1024 * 1024
+# On the wire a unit is sealed.
+MIN_SEALED_SIZE = FRAME_HEADER_SIZE + TAG_SIZE
+MAX_SEALED_SIZE = MAX_UNIT_SIZE + TAG_SIZE
 
 _DAMAGED, _REGISTERED, _HAS_COLOR, _HAS_DEPTH = 1, 2, 4, 8
 _ALL_FLAGS = _DAMAGED | _REGISTERED | _HAS_COLOR | _HAS_DEPTH
 _MAX_U32 = 2**32 - 1
 
-# The header fields that the frame's crc covers: session, number, unit size, payload size.
+# The header fields that the seal binds: session, number, unit size, payload size.
 _PLACE = struct.Struct("<QQIH")
 
 
@@ -50,8 +53,11 @@ def pack_unit(frame: EncodedFrame) -> bytes:
     return b"".join((header, color_data, depth_data))
 
 
-def parse_unit(unit: Buffer, camera_id: int) -> EncodedFrame:
-    """The frame of a unit, stamped in agent time; DataError for what SPEC section 3 does not allow."""
+def parse_unit(unit: bytes, camera_id: int) -> EncodedFrame:
+    """The frame of a unit, stamped in agent time; DataError for what SPEC section 3 does not allow.
+
+    The payloads are views of the unit, not copies.
+    """
     if len(unit) < FRAME_HEADER_SIZE:
         raise DataError(f"a unit of {len(unit)} bytes has no frame header")
     sequence, time_ns, uncertainty_ns, flags, color_codec, depth_codec, color_size, depth_size = (
@@ -72,13 +78,17 @@ def parse_unit(unit: Buffer, camera_id: int) -> EncodedFrame:
     )
 
 
-def frame_crc(unit: Buffer, place: FragmentHeader) -> int:
-    """CRC-32 of a unit at its place: session, frame number, unit size and payload size."""
-    head = _PLACE.pack(place.session_id, place.frame_number, place.unit_size, place.payload_size)
-    return zlib.crc32(unit, zlib.crc32(head))
+def sealed_place(header: FragmentHeader) -> bytes:
+    """What the seal of a unit binds beside its content: its place on the wire."""
+    return _PLACE.pack(header.session_id, header.frame_number, header.unit_size, header.payload_size)
+
+
+def leading_seal(sealed: Buffer) -> int:
+    """What the fragments of a sealed unit carry of its tag."""
+    return int.from_bytes(sealed[-TAG_SIZE : 4 - TAG_SIZE], "little")
 
 
 def _payload(present: int, codec_id: int, data: memoryview) -> Payload | None:
     if bool(present) != bool(codec_id) or (data and not present):
         raise DataError("a payload without its flag or codec, or the other way round")
-    return Payload(codec_id, bytes(data)) if present else None
+    return Payload(codec_id, data) if present else None

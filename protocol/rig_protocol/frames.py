@@ -51,7 +51,7 @@ class Payload:
     """One encoded image: the codec's wire id and its bytes."""
 
     codec_id: int
-    data: bytes
+    data: bytes | memoryview
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,7 +1,6 @@
-"""Control messages to and from bytes: strict, bounded (protocol/SPEC.md, sections 2, 4, 5 and 8)."""
+"""Bodies of control messages to and from bytes: strict, bounded (protocol/SPEC.md, sections 4 to 8)."""
 
 import struct
-import zlib
 from collections.abc import Callable
 from typing import Any
 
@@ -13,14 +12,13 @@ from rig_protocol.datagram import (
     MAX_DATAGRAM_SIZE,
     MIN_DATAGRAM_SIZE,
     PREFIX_SIZE,
-    Buffer,
     MessageType,
-    Prefix,
-    pack_prefix,
 )
 from rig_protocol.errors import DataError, LinkUsageError
 from rig_protocol.message_fields import (
     Fields,
+    cipher,
+    ciphers,
     codec_ids,
     gauges,
     integer,
@@ -39,58 +37,61 @@ from rig_protocol.messages import (
     Message,
     Reject,
     RejectReason,
+    Resend,
+    StreamPlan,
     UnknownSession,
     Welcome,
 )
+from rig_protocol.security import PUBLIC_KEY_SIZE, TAG_SIZE
 
 MAX_CONTROL_SIZE = MIN_DATAGRAM_SIZE
 # No answer to a stranger's hello is larger than the hello: SPEC section 5, for all versions.
 MIN_HELLO_SIZE = MAX_REJECT_SIZE = 512
+# Prefix, public key and tag around the body of a hello.
+HELLO_OVERHEAD = PREFIX_SIZE + PUBLIC_KEY_SIZE + TAG_SIZE
 MAX_NAME_BYTES = 64
 MAX_TEXT_BYTES = 200
 MAX_CODECS = 16
 MAX_GAUGES = 16
 MAX_GAUGE_NAME_BYTES = 32
 MIN_FPS, MAX_FPS = 0.1, 240.0
+# 4 bytes each; a frame with more gaps is asked for in several messages.
+MAX_RANGES = 250
+_MAX_STEP_NS = 1_000_000_000
 
 _REJECT = struct.Struct("<BBBx")
 _CLOCK_REQUEST = struct.Struct("<q")
-_CLOCK_REPLY = struct.Struct("<qqq")
-# zlib.crc32 of the datagram without its crc field, which lies here.
-_CRC_START, _CRC_END = 4, 8
+_CLOCK_REPLY = struct.Struct("<qqqqQ")
+_RESEND = struct.Struct("<Q")
+_UNDISCIPLINED = 2**64 - 1
+_RANGE = np.dtype([("first", "<u2"), ("count", "<u2")])
 
 
-def encode_message(message: Message, id_: int) -> bytes:
-    """The datagram of a control message; LinkUsageError when it breaks a limit of the protocol."""
+def encode_body(message: Message) -> tuple[MessageType, bytes]:
+    """Type and body of a message; LinkUsageError when it breaks a limit of the protocol."""
     message_type, write = _WRITERS[type(message)]
     body = write(message)
-    size = PREFIX_SIZE + len(body)
+    size = len(body) + HELLO_OVERHEAD  # that of a hello is the largest
     if size > MAX_CONTROL_SIZE:
         raise LinkUsageError(
             f"{message_type.name} takes {size} bytes, at most {MAX_CONTROL_SIZE} are allowed"
         )
-    datagram = pack_prefix(message_type, 0, id_) + body
-    return datagram[:_CRC_START] + control_crc(datagram).to_bytes(4, "little") + datagram[_CRC_END:]
+    return message_type, body
 
 
-def decode_message(prefix: Prefix, datagram: Buffer) -> Message:
-    """The message of a datagram whose crc holds; DataError says what breaks SPEC sections 4, 5 or 8."""
-    if len(datagram) > MAX_CONTROL_SIZE:
-        raise DataError(f"a control message of {len(datagram)} bytes, at most {MAX_CONTROL_SIZE} are allowed")
-    return _READERS[MessageType(prefix.type)](bytes(datagram[PREFIX_SIZE:]))
+def decode_body(message_type: int, body: bytes) -> Message:
+    """The message of a body; DataError says what breaks SPEC sections 4, 5, 7 or 8."""
+    return _READERS[MessageType(message_type)](body)
 
 
-def decode_hello(prefix: Prefix, datagram: Buffer) -> Hello:
-    """The hello of a datagram whose prefix says HELLO; DataError as `decode_message`."""
-    message = decode_message(prefix, datagram)
-    if not isinstance(message, Hello):
-        raise LinkUsageError(f"type {prefix.type} is no hello")
-    return message
+def decode_hello(body: bytes) -> Hello:
+    """The hello of an authentic body; DataError as `decode_body`."""
+    return _read_hello(body)
 
 
-def control_crc(datagram: Buffer) -> int:
-    """CRC-32 of a control message: of everything but its crc field."""
-    return zlib.crc32(datagram[_CRC_END:], zlib.crc32(datagram[:_CRC_START]))
+def decode_welcome(body: bytes) -> Welcome:
+    """The welcome of an authentic body; DataError as `decode_body`."""
+    return _read_welcome(body)
 
 
 def printable(text: str) -> str:
@@ -118,9 +119,10 @@ def _write_hello(hello: Hello) -> bytes:
         "depth_codecs": list(hello.depth_codecs),
         "fps": hello.fps,
         "software": hello.software,
+        "ciphers": [int(one) for one in hello.ciphers],
         "padding": b"",
     }
-    missing = MIN_HELLO_SIZE - PREFIX_SIZE - len(msgpack.packb(values))
+    missing = MIN_HELLO_SIZE - HELLO_OVERHEAD - len(msgpack.packb(values))
     values["padding"] = bytes(max(0, missing))
     return bytes(msgpack.packb(values))
 
@@ -128,7 +130,11 @@ def _write_hello(hello: Hello) -> bytes:
 def _check_hello(hello: Hello) -> None:
     """A hello that the other end would call malformed is a mistake of this end."""
     values = {name: getattr(hello, name) for name in ("name", "camera_id", "serial", "port_path", "software")}
-    codecs = {"color_codecs": list(hello.color_codecs), "depth_codecs": list(hello.depth_codecs)}
+    codecs = {
+        "color_codecs": list(hello.color_codecs),
+        "depth_codecs": list(hello.depth_codecs),
+        "ciphers": [int(one) for one in hello.ciphers],
+    }
     try:
         _hello_of({**values, **codecs, "fps": hello.fps}, hello.model)
     except DataError as error:
@@ -153,6 +159,7 @@ def _hello_of(values: Fields, model: CameraModel) -> Hello:
         depth_codecs=codec_ids(values, "depth_codecs", MAX_CODECS),
         fps=number(values, "fps", MIN_FPS, MAX_FPS),
         software=text(values, "software", MAX_NAME_BYTES),
+        ciphers=ciphers(values, "ciphers"),
     )
     if not hello.color_codecs and not hello.depth_codecs:
         raise DataError("neither color_codecs nor depth_codecs offers a stream")
@@ -168,9 +175,10 @@ def _write_welcome(welcome: Welcome) -> bytes:
             {
                 "session_id": welcome.session_id,
                 "camera_id": welcome.camera_id,
-                "color_codec": welcome.color_codec,
-                "depth_codec": welcome.depth_codec,
+                "color_codecs": list(welcome.color_codecs),
+                "depth_codecs": list(welcome.depth_codecs),
                 "datagram_size": welcome.datagram_size,
+                "cipher": int(welcome.cipher),
             }
         )
     )
@@ -181,9 +189,10 @@ def _read_welcome(body: bytes) -> Welcome:
     return Welcome(
         session_id=integer(values, "session_id", 1, 2**64 - 1),
         camera_id=integer(values, "camera_id", 0, 255),
-        color_codec=optional(integer, values, "color_codec", 1, 255),
-        depth_codec=optional(integer, values, "depth_codec", 1, 255),
+        color_codecs=codec_ids(values, "color_codecs", MAX_CODECS),
+        depth_codecs=codec_ids(values, "depth_codecs", MAX_CODECS),
         datagram_size=integer(values, "datagram_size", MIN_DATAGRAM_SIZE, MAX_DATAGRAM_SIZE),
+        cipher=cipher(values.get("cipher")),
     )
 
 
@@ -220,25 +229,79 @@ def _write_heartbeat(heartbeat: Heartbeat) -> bytes:
         health = gauges({"health": dict(heartbeat.health)}, "health", MAX_GAUGES, MAX_GAUGE_NAME_BYTES)
     except DataError as error:
         raise LinkUsageError(f"this heartbeat cannot be sent: {error}") from error
-    return bytes(msgpack.packb({"health": health}))
+    return bytes(msgpack.packb({"health": health, "frames": heartbeat.frames}))
 
 
 def _read_heartbeat(body: bytes) -> Heartbeat:
-    return Heartbeat(gauges(unpack_map(body), "health", MAX_GAUGES, MAX_GAUGE_NAME_BYTES))
+    values = unpack_map(body)
+    health = gauges(values, "health", MAX_GAUGES, MAX_GAUGE_NAME_BYTES)
+    return Heartbeat(health, integer(values, "frames", 0, 2**64 - 1))
 
 
 def _read_clock_request(body: bytes) -> ClockRequest:
     return ClockRequest(*unpack_fixed(_CLOCK_REQUEST, body))
 
 
+def _write_clock_reply(reply: ClockReply) -> bytes:
+    error_ns = _UNDISCIPLINED if reply.wall_error_ns is None else reply.wall_error_ns
+    return _CLOCK_REPLY.pack(reply.t1_ns, reply.t2_ns, reply.t3_ns, reply.wall_minus_agent_ns, error_ns)
+
+
 def _read_clock_reply(body: bytes) -> ClockReply:
-    return ClockReply(*unpack_fixed(_CLOCK_REPLY, body))
+    t1_ns, t2_ns, t3_ns, wall_minus_agent_ns, error_ns = unpack_fixed(_CLOCK_REPLY, body)
+    known = None if error_ns == _UNDISCIPLINED else error_ns
+    return ClockReply(t1_ns, t2_ns, t3_ns, wall_minus_agent_ns, known)
 
 
 def _read_unknown_session(body: bytes) -> UnknownSession:
     if body:
         raise DataError(f"{len(body)} bytes after an UNKNOWN_SESSION")
     return UnknownSession()
+
+
+# ---- RESEND
+
+
+def _write_resend(resend: Resend) -> bytes:
+    if not 0 < len(resend.ranges) <= MAX_RANGES:
+        raise LinkUsageError(f"{len(resend.ranges)} ranges in a resend, 1 to {MAX_RANGES} are allowed")
+    return _RESEND.pack(resend.frame_number) + np.array(resend.ranges, "<u2").tobytes()
+
+
+def _read_resend(body: bytes) -> Resend:
+    size = len(body) - _RESEND.size
+    if not 0 < size <= MAX_RANGES * _RANGE.itemsize or size % _RANGE.itemsize:
+        raise DataError(f"a resend body of {len(body)} bytes")
+    (frame_number,) = _RESEND.unpack_from(body)
+    ranges = np.frombuffer(body, _RANGE, offset=_RESEND.size)
+    return Resend(frame_number, tuple((int(first), int(count)) for first, count in ranges))
+
+
+# ---- PLAN
+
+
+def _write_plan(plan: StreamPlan) -> bytes:
+    values = {name: getattr(plan, name) for name in StreamPlan.__slots__}
+    try:
+        _plan_of(values)
+    except DataError as error:
+        raise LinkUsageError(f"this plan cannot be sent: {error}") from error
+    return bytes(msgpack.packb(values))
+
+
+def _read_plan(body: bytes) -> StreamPlan:
+    return _plan_of(unpack_map(body))
+
+
+def _plan_of(values: Fields) -> StreamPlan:
+    step_ns = integer(values, "step_ns", 1, _MAX_STEP_NS)
+    return StreamPlan(
+        color_codec=optional(integer, values, "color_codec", 1, 255),
+        depth_codec=optional(integer, values, "depth_codec", 1, 255),
+        fps=number(values, "fps", MIN_FPS, MAX_FPS),
+        step_ns=step_ns,
+        phase_ns=integer(values, "phase_ns", 0, step_ns - 1),
+    )
 
 
 _WRITERS: dict[type[Message], tuple[MessageType, Callable[[Any], bytes]]] = {
@@ -248,8 +311,10 @@ _WRITERS: dict[type[Message], tuple[MessageType, Callable[[Any], bytes]]] = {
     Goodbye: (MessageType.GOODBYE, _write_goodbye),
     Heartbeat: (MessageType.HEARTBEAT, _write_heartbeat),
     ClockRequest: (MessageType.CLOCK_REQUEST, lambda m: _CLOCK_REQUEST.pack(m.t1_ns)),
-    ClockReply: (MessageType.CLOCK_REPLY, lambda m: _CLOCK_REPLY.pack(m.t1_ns, m.t2_ns, m.t3_ns)),
+    ClockReply: (MessageType.CLOCK_REPLY, _write_clock_reply),
     UnknownSession: (MessageType.UNKNOWN_SESSION, lambda _: b""),
+    Resend: (MessageType.RESEND, _write_resend),
+    StreamPlan: (MessageType.PLAN, _write_plan),
 }
 
 _READERS: dict[MessageType, Callable[[bytes], Message]] = {
@@ -261,4 +326,6 @@ _READERS: dict[MessageType, Callable[[bytes], Message]] = {
     MessageType.CLOCK_REQUEST: _read_clock_request,
     MessageType.CLOCK_REPLY: _read_clock_reply,
     MessageType.UNKNOWN_SESSION: _read_unknown_session,
+    MessageType.RESEND: _read_resend,
+    MessageType.PLAN: _read_plan,
 }

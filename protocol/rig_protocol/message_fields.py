@@ -8,6 +8,7 @@ from typing import Any, TypeVar
 import msgpack
 
 from rig_protocol.errors import DataError
+from rig_protocol.security import Cipher
 
 Fields = Mapping[str, Any]
 T = TypeVar("T")
@@ -73,6 +74,23 @@ def codec_ids(values: Fields, key: str, most: int) -> tuple[int, ...]:
     if not isinstance(ids, list) or len(ids) > most:
         raise DataError(f"{key} must be a list of at most {most} codec ids")
     return tuple(integer({key: item}, key, 1, 255) for item in ids)
+
+
+def cipher(value: Any) -> Cipher:
+    """A cipher that this version knows."""
+    try:
+        return Cipher(value)
+    except ValueError as error:
+        raise DataError("cipher must be one that this version knows") from error
+
+
+def ciphers(values: Fields, key: str) -> tuple[Cipher, ...]:
+    """The known ones of the ciphers offered, in their order; at least one."""
+    known = {int(one): one for one in Cipher}
+    found = tuple(known[id_] for id_ in codec_ids(values, key, len(known) + 6) if id_ in known)
+    if not found:
+        raise DataError(f"{key} offers no cipher that this version knows")
+    return found
 
 
 def gauges(values: Fields, key: str, most: int, longest_name: int) -> dict[str, float]:

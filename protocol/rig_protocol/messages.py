@@ -7,6 +7,7 @@ from enum import Enum
 from rig_protocol.camera import CameraModel
 from rig_protocol.datagram import VERSION
 from rig_protocol.frames import EncodedFrame
+from rig_protocol.security import Cipher
 
 
 class RejectReason(Enum):
@@ -17,6 +18,7 @@ class RejectReason(Enum):
     DUPLICATE_SLOT = 3
     NO_COMMON_CODEC = 4
     MALFORMED = 5
+    WRONG_KEY = 6
     OTHER = 255  # a reason of a later version; the text says it
 
 
@@ -25,7 +27,8 @@ class Hello:
     """Who an agent is and what it can send.
 
     `camera_id` is the slot in the rig; None leaves it to the server, which knows the camera by its
-    serial or port path. Codecs are wire ids in the agent's order of preference.
+    serial or port path. Codecs are wire ids in the agent's order of preference; ciphers in the order of
+    their speed on the agent's processor.
     """
 
     name: str
@@ -37,22 +40,28 @@ class Hello:
     depth_codecs: tuple[int, ...]
     fps: float
     software: str
+    ciphers: tuple[Cipher, ...] = tuple(Cipher)
 
 
 @dataclass(frozen=True, slots=True)
 class Welcome:
-    """The server's choices for one session; a codec of None means: do not send this stream."""
+    """The server's choices for one session.
+
+    Of the codecs, those of the hello that it takes, in the agent's order; none means: do not send this
+    stream. The first is the one to send until a plan says otherwise.
+    """
 
     session_id: int
     camera_id: int
-    color_codec: int | None
-    depth_codec: int | None
+    color_codecs: tuple[int, ...]
+    depth_codecs: tuple[int, ...]
     datagram_size: int
+    cipher: Cipher
 
     def allows(self, frame: EncodedFrame) -> bool:
-        """True when every payload of the frame is in the codec chosen for its stream."""
-        streams = ((frame.color, self.color_codec), (frame.depth, self.depth_codec))
-        return all(payload is None or payload.codec_id == chosen for payload, chosen in streams)
+        """True when every payload of the frame is in a codec that the server takes for its stream."""
+        streams = ((frame.color, self.color_codecs), (frame.depth, self.depth_codecs))
+        return all(payload is None or payload.codec_id in taken for payload, taken in streams)
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,6 +72,21 @@ class Reject:
     text: str
     lowest_version: int = VERSION
     highest_version: int = VERSION
+
+
+@dataclass(frozen=True, slots=True)
+class StreamChoice:
+    """What the server wants of one agent: a plan that does not know the agent's clock yet.
+
+    Of each `step_ns` of rig time the agents take turns: this one is `slot` of `slots`.
+    """
+
+    color_codec: int | None
+    depth_codec: int | None
+    fps: float
+    step_ns: int
+    slot: int
+    slots: int
 
 
 @dataclass(frozen=True, slots=True)
@@ -89,9 +113,13 @@ class Goodbye:
 
 @dataclass(frozen=True, slots=True)
 class Heartbeat:
-    """The agent is alive; `health` are its own gauges by name, for the operator."""
+    """The agent is alive; `health` are its own gauges by name, for the operator.
+
+    `frames`: how many frames of this session have been sent, so that the last ones are missed, too.
+    """
 
     health: Mapping[str, float]
+    frames: int = 0
 
 
 @dataclass(frozen=True, slots=True)
@@ -103,11 +131,28 @@ class ClockRequest:
 
 @dataclass(frozen=True, slots=True)
 class ClockReply:
-    """`t1_ns` echoed; `t2_ns` and `t3_ns`: agent time at receiving the request and sending this."""
+    """`t1_ns` echoed; `t2_ns` and `t3_ns`: agent time at receiving the request and sending this.
+
+    `wall_minus_agent_ns` and `wall_error_ns`: the agent's system clock against agent time, and its
+    standard error where something disciplines it (chrony, PTP); None where nothing does.
+    """
 
     t1_ns: int
     t2_ns: int
     t3_ns: int
+    wall_minus_agent_ns: int = 0
+    wall_error_ns: int | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class Resend:
+    """Fragments of a frame that did not arrive: (first index, count), ascending.
+
+    WHOLE_FRAME asks for all of a frame of which nothing arrived.
+    """
+
+    frame_number: int
+    ranges: tuple[tuple[int, int], ...]
 
 
 @dataclass(frozen=True, slots=True)
@@ -115,4 +160,17 @@ class UnknownSession:
     """The server does not know the session that the prefix names."""
 
 
-Message = Hello | Welcome | Reject | Goodbye | Heartbeat | ClockRequest | ClockReply | UnknownSession
+Message = (
+    Hello
+    | Welcome
+    | Reject
+    | Goodbye
+    | Heartbeat
+    | ClockRequest
+    | ClockReply
+    | UnknownSession
+    | Resend
+    | StreamPlan
+)
+
+WHOLE_FRAME = ((0, 0xFFFF),)

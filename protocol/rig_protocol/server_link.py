@@ -5,7 +5,7 @@ is due, and fetches `next_event` until None. Rules: protocol/SPEC.md, sections 6
 """
 
 from collections import Counter, deque
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from types import MappingProxyType
 
 from rig_protocol.admission import (
@@ -15,7 +15,9 @@ from rig_protocol.admission import (
     malformed_hello,
     same_agent,
     version_mismatch,
+    wrong_key,
 )
+from rig_protocol.clear_datagram import clear_crc, encode_clear
 from rig_protocol.datagram import (
     DEFAULT_DATAGRAM_SIZE,
     FRAGMENT_PREFIX,
@@ -41,13 +43,8 @@ from rig_protocol.events import (
     HelloRefused,
     ServerEvent,
 )
-from rig_protocol.message_bytes import (
-    MIN_HELLO_SIZE,
-    control_crc,
-    decode_hello,
-    decode_message,
-    encode_message,
-)
+from rig_protocol.handshake import NotAuthentic, answer_hello, fresh_id, open_hello
+from rig_protocol.message_bytes import MAX_CONTROL_SIZE, MIN_HELLO_SIZE, decode_body, encode_body
 from rig_protocol.messages import (
     ClockReply,
     Goodbye,
@@ -55,22 +52,27 @@ from rig_protocol.messages import (
     Hello,
     Message,
     Reject,
+    StreamChoice,
     UnknownSession,
     Welcome,
 )
+from rig_protocol.pending_sessions import PendingSession, PendingSessions
 from rig_protocol.rate_limit import RateLimit
+from rig_protocol.rig_key import RigKey
 from rig_protocol.roster import Roster
+from rig_protocol.sealed_channel import SealedChannel
+from rig_protocol.security import RandomBytes
 from rig_protocol.server_session import CameraStatus, ServerSession
 
-# A copy of a hello does not outlive that many sessions of its slot.
-_MAX_NONCES = 8
 _NOTICE_INTERVAL_NS = 100_000_000  # to one address
 _NOTICE_INTERVAL_ALL_NS = 5_000_000
+# A key agreement costs 0.1 ms: so many a second are 1 % of a core, and join a rig in a tenth of a second.
+_HANDSHAKE_INTERVAL_NS = 10_000_000
 _REFUSAL_EVENT_INTERVAL_NS = 1_000_000_000
 # Answers wait for one turn of the shell; a flood of hellos beyond this loses its oldest answers.
 _MAX_OUTGOING = 1024
 _ASSIGNED = frozenset(MessageType)
-_FROM_AGENT = frozenset({MessageType.GOODBYE, MessageType.HEARTBEAT, MessageType.CLOCK_REPLY})
+_SEALED = frozenset({MessageType.GOODBYE, MessageType.HEARTBEAT, MessageType.CLOCK_REPLY})
 
 
 class ServerLink:
@@ -79,29 +81,33 @@ class ServerLink:
     def __init__(
         self,
         roster: Roster,
-        session_id_source: Callable[[], int],
+        rig_key: RigKey,
+        random_bytes: RandomBytes,
         color_codecs: Sequence[int],
         depth_codecs: Sequence[int],
         datagram_size: int = DEFAULT_DATAGRAM_SIZE,
     ) -> None:
-        """`session_id_source` yields unguessable 64-bit numbers; the codecs are those the server decodes."""
+        """`random_bytes` is an unguessable source; the codecs are those that the server decodes."""
         if not MIN_DATAGRAM_SIZE <= datagram_size <= MAX_DATAGRAM_SIZE:
             raise LinkUsageError(
                 f"datagram size {datagram_size} is not in {MIN_DATAGRAM_SIZE}..{MAX_DATAGRAM_SIZE}"
             )
         self.rejected: Counter[str] = Counter()
         self._roster = roster
-        self._session_id_source = session_id_source
+        self._rig_key, self._random_bytes = rig_key, random_bytes
         self._color_codecs, self._depth_codecs = tuple(color_codecs), tuple(depth_codecs)
         self._datagram_size = datagram_size
         self._closed = False
         self._statuses: dict[int, CameraStatus] = {}
         self._sessions: dict[int, ServerSession] = {}  # by session id
-        self._nonces: dict[int, deque[int]] = {}  # of accepted hellos, by camera id
+        self._pending = PendingSessions()
+        self._clock_due: list[ServerSession] = []
+        self._due_ns: int | None = None  # never later than what is due; None: nobody is connected
         self._events = EventQueue()
         self._outgoing: deque[tuple[bytes, Address]] = deque(maxlen=_MAX_OUTGOING)
         self._notices = RateLimit(_NOTICE_INTERVAL_NS)
         self._all_notices = RateLimit(_NOTICE_INTERVAL_ALL_NS, max_keys=1)
+        self._handshakes = RateLimit(_HANDSHAKE_INTERVAL_NS, max_keys=1)
         self._refusal_events = RateLimit(_REFUSAL_EVENT_INTERVAL_NS)
 
     @property
@@ -126,26 +132,37 @@ class ServerLink:
         self._receive(data, address, now_ns)
 
     def datagrams_to_send(self, now_ns: int) -> list[tuple[bytes, Address]]:
-        """Everything to transmit now; clock requests are stamped with `now_ns`."""
-        for session in self._sessions.values():
-            request = session.clock_request(now_ns)
-            if request is not None:
-                self._send(request, session.welcome.session_id, session.address)
+        """Everything to transmit now; clock requests that `handle_timeout` found due are stamped `now_ns`."""
+        for session in self._clock_due:
+            for datagram in session.periodic_messages(now_ns):
+                self._outgoing.append((datagram, session.address))
+        self._clock_due.clear()
         datagrams = list(self._outgoing)
         self._outgoing.clear()
         return datagrams
 
     def next_timeout_ns(self) -> int | None:
         """When to call `handle_timeout` and `datagrams_to_send` next; None while nobody is connected."""
-        return min((session.next_timeout_ns for session in self._sessions.values()), default=None)
+        return self._due_ns
 
     def handle_timeout(self, now_ns: int) -> None:
-        """Give up late frames and silent agents."""
+        """Give up late frames and silent agents, ask for missed fragments and for the time."""
+        self._clock_due.clear()
         for session in list(self._sessions.values()):
-            session.expire(now_ns)
+            for request in session.handle_timeout(now_ns):
+                self._outgoing.append((request, session.address))
             if session.silent(now_ns):
                 silence_s = (now_ns - session.last_heard_ns) / 1e9
                 self._end(session, f"silent for {silence_s:.1f} s")
+            elif session.due_ns <= now_ns:  # only the clock can be due again
+                self._clock_due.append(session)
+        self._due_ns = min((session.due_ns for session in self._sessions.values()), default=None)
+
+    def plan_stream(self, camera_id: int, choice: StreamChoice) -> None:
+        """What a connected camera is to send from now on; told with its next clock request."""
+        session = self._holder(camera_id)
+        if session is not None:
+            session.choice = choice
 
     def next_event(self) -> ServerEvent | None:
         """The oldest event that was not fetched yet, or None."""
@@ -155,8 +172,9 @@ class ServerLink:
         """End every session with a goodbye, to be fetched with `datagrams_to_send`; welcome nobody after."""
         self._closed = True
         for session in list(self._sessions.values()):
-            self._send(Goodbye("the server stops"), session.welcome.session_id, session.address)
+            self._outgoing.append((session.seal(Goodbye("the server stops")), session.address))
             self._end(session, "the server stops")
+        self._pending.clear()
 
     # ---- dispatch
 
@@ -173,12 +191,12 @@ class ServerLink:
             self._receive_hello(prefix, datagram, address, now_ns)
         elif prefix.version != VERSION:
             self.rejected["other_version"] += 1
-        elif prefix.type not in _FROM_AGENT:
+        elif prefix.type not in _SEALED:
             self.rejected["unexpected_type" if prefix.type in _ASSIGNED else "unknown_type"] += 1
-        elif prefix.crc != control_crc(datagram):
-            self.rejected["corrupt_control"] += 1
+        elif len(datagram) > MAX_CONTROL_SIZE:
+            self.rejected["malformed"] += 1
         else:
-            self._receive_control(prefix, datagram, address, now_ns)
+            self._receive_sealed(prefix, datagram, address, now_ns)
 
     def _receive_fragments(self, run: Buffer, count: int, address: Address, now_ns: int) -> None:
         header = parse_fragment_header(run)
@@ -190,39 +208,59 @@ class ServerLink:
             return
         session.status.counters.bytes += len(run)
         frame = session.receive_fragments(header, run, count, now_ns)
+        self._wake_at(session.due_ns)
         if frame is not None:
             self._push(FrameReceived(frame))
 
-    def _receive_control(self, prefix: Prefix, datagram: Buffer, address: Address, now_ns: int) -> None:
+    def _receive_sealed(self, prefix: Prefix, datagram: Buffer, address: Address, now_ns: int) -> None:
+        if prefix.id in self._pending:
+            self._confirm(prefix, datagram, address, now_ns)
+            return
         session = self._session_of(prefix.id, 1, address, now_ns)
         if session is None:
             return
+        body = session.open(datagram, now_ns)
+        if isinstance(body, str):
+            self.rejected[body] += 1
+            return
+        self._receive_body(session, prefix.type, body, now_ns)
+        self._wake_at(session.due_ns)
+
+    def _receive_body(self, session: ServerSession, message_type: int, body: bytes, now_ns: int) -> None:
         try:
-            message = decode_message(prefix, datagram)
+            message = decode_body(message_type, body)
         except DataError:
             self.rejected["malformed"] += 1
             return
         match message:
-            case Heartbeat(health):
-                session.status.health = health
+            case Heartbeat():
+                session.receive_heartbeat(message, now_ns)
             case ClockReply():
                 session.receive_clock_reply(message, now_ns)
             case Goodbye(text):
                 self._end(session, f"goodbye: {text}")
 
     def _session_of(self, session_id: int, count: int, address: Address, now_ns: int) -> ServerSession | None:
-        """The session of a datagram, now heard; None (counted, answered) when there is none."""
+        """The session of a datagram; None (counted, answered) when there is none."""
         session = self._sessions.get(session_id)
         if session is None:
             self.rejected["unknown_session"] += count
-            if self._notices.allows(address, now_ns) and self._all_notices.allows("all", now_ns):
-                self._send(UnknownSession(), session_id, address)
+            known = session_id in self._pending
+            if (
+                not known
+                and self._notices.allows(address, now_ns)
+                and self._all_notices.allows("all", now_ns)
+            ):
+                self._send_clear(UnknownSession(), session_id, address)
             return None
         if session.address != address:
             self.rejected["wrong_address"] += count
             return None
-        session.last_heard_ns = now_ns
         return session
+
+    def _wake_at(self, due_ns: int) -> None:
+        if self._due_ns is None or due_ns < self._due_ns:
+            self._due_ns = due_ns
 
     # ---- sessions
 
@@ -231,7 +269,7 @@ class ServerLink:
             self.rejected["closed"] += 1
         elif len(datagram) < MIN_HELLO_SIZE or prefix.id == 0:
             self.rejected["malformed"] += 1
-        elif prefix.crc != control_crc(datagram):
+        elif prefix.crc != clear_crc(datagram):
             self.rejected["corrupt_control"] += 1
         elif prefix.version != VERSION:
             self._refuse(version_mismatch(prefix.version), prefix.id, address, now_ns)
@@ -241,38 +279,84 @@ class ServerLink:
                 self._refuse(refusal, prefix.id, address, now_ns)
 
     def _take_hello(self, prefix: Prefix, datagram: Buffer, address: Address, now_ns: int) -> Reject | None:
-        """Welcome a camera, or say why not."""
+        """Answer a hello, or say why not. Nothing but a bounded table changes before the agent confirms."""
+        known = self._pending.of_nonce(prefix.id)
+        if known is not None or self._pending.was_used(prefix.id):
+            self._answer_copy(known, address)
+            return None
         try:
-            hello = decode_hello(prefix, datagram)
+            hello = open_hello(datagram, prefix.id, self._rig_key)
+        except NotAuthentic:
+            return wrong_key(self._rig_key.is_public)
         except DataError as error:
             return malformed_hello(error)
+        welcome = self._choose(hello, address, now_ns)
+        if isinstance(welcome, Reject):
+            return welcome
+        if self._handshakes.allows("all", now_ns):
+            self._answer_hello(prefix.id, datagram, hello, welcome, address)
+        else:  # the agent tries again in a moment
+            self.rejected["handshake_limit"] += 1
+        return None
+
+    def _choose(self, hello: Hello, address: Address, now_ns: int) -> Welcome | Reject:
         camera_id = self._roster.assign(hello, self._recall(hello, address), self._taken(hello, address))
         if isinstance(camera_id, Reject):
             return camera_id
         holder = self._holder(camera_id)
-        if prefix.id in self._nonces.get(camera_id, ()):
-            self._answer_copy(holder, prefix.id, address)
-            return None
         if holder is not None and not gives_way(holder, hello, address, now_ns):
             return duplicate_slot(holder, hello, now_ns)
         codecs = choose_codecs(hello, self._color_codecs, self._depth_codecs)
         if isinstance(codecs, Reject):
             return codecs
+        return Welcome(self._new_session_id(), camera_id, *codecs, self._datagram_size, hello.ciphers[0])
+
+    def _answer_hello(
+        self, nonce: int, datagram: Buffer, hello: Hello, welcome: Welcome, address: Address
+    ) -> None:
+        try:
+            answer, agreement = answer_hello(datagram, nonce, welcome, self._rig_key, self._random_bytes)
+        except DataError:
+            self.rejected["malformed"] += 1
+            return
+        self._pending.add(PendingSession(hello, nonce, address, agreement, answer))
+        self._outgoing.append((answer, address))
+
+    def _answer_copy(self, known: PendingSession | None, address: Address) -> None:
+        """A hello came again: our answer to it was lost, or it is a copy of an old one."""
+        if known is not None and known.address == address:
+            self._outgoing.append((known.welcome_datagram, address))
+        else:
+            self.rejected["stale_hello"] += 1
+
+    def _confirm(self, prefix: Prefix, datagram: Buffer, address: Address, now_ns: int) -> None:
+        """The first sealed message of a session proves that its agent is there: the session begins."""
+        pending = self._pending.of_id(prefix.id)
+        if pending is None or pending.address != address:
+            self.rejected["wrong_address"] += 1
+            return
+        if isinstance(_opened(pending, datagram), str):
+            self.rejected["bad_seal"] += 1
+            return
+        self._pending.take(prefix.id)
+        holder = self._holder(pending.agreement.welcome.camera_id)
+        if holder is not None and not gives_way(holder, pending.hello, address, now_ns):
+            self.rejected["refused_duplicate_slot"] += 1  # another agent was quicker; the next hello is told
+            return
         if holder is not None:
             self._end(holder, "replaced by a new session")
-        welcome = Welcome(self._new_session_id(), camera_id, *codecs, self._datagram_size)
-        self._begin(welcome, hello, prefix.id, address, now_ns)
-        return None
+        self._begin(pending, now_ns)
+        self._receive_sealed(prefix, datagram, address, now_ns)
 
-    def _begin(self, welcome: Welcome, hello: Hello, nonce: int, address: Address, now_ns: int) -> None:
+    def _begin(self, pending: PendingSession, now_ns: int) -> None:
+        welcome, hello, address = pending.agreement.welcome, pending.hello, pending.address
         status = self._statuses.get(welcome.camera_id)
         if status is None:
             status = CameraStatus(welcome.camera_id, hello.name, address, hello)
             self._statuses[welcome.camera_id] = status
         status.joined(hello, address)
-        self._nonces.setdefault(welcome.camera_id, deque(maxlen=_MAX_NONCES)).append(nonce)
-        self._sessions[welcome.session_id] = ServerSession(status, nonce, welcome, now_ns)
-        self._send(welcome, nonce, address)
+        self._sessions[welcome.session_id] = ServerSession(status, pending.agreement, now_ns)
+        self._wake_at(now_ns)
         self._push(CameraJoined(welcome.camera_id, hello, address))
 
     def _end(self, session: ServerSession, text: str) -> None:
@@ -280,16 +364,10 @@ class ServerLink:
         session.close()
         self._push(CameraLeft(session.welcome.camera_id, text))
 
-    def _answer_copy(self, holder: ServerSession | None, nonce: int, address: Address) -> None:
-        """A hello came again: our answer to it was lost, or it is a late copy of an old one."""
-        if holder is not None and holder.hello_nonce == nonce and holder.address == address:
-            self._send(holder.welcome, nonce, address)
-        else:
-            self.rejected["stale_hello"] += 1
-
     def _refuse(self, reject: Reject, nonce: int, address: Address, now_ns: int) -> None:
         self.rejected[f"refused_{reject.reason.name.lower()}"] += 1
-        self._send(reject, nonce, address)
+        if self._notices.allows(address, now_ns) and self._all_notices.allows("all", now_ns):
+            self._send_clear(reject, nonce, address)
         if self._refusal_events.allows(address, now_ns):
             self._push(HelloRefused(address, reject.reason, reject.text))
 
@@ -307,15 +385,14 @@ class ServerLink:
         return {session.welcome.camera_id for session in others}
 
     def _new_session_id(self) -> int:
-        while True:
-            session_id = self._session_id_source()
-            if session_id and session_id not in self._sessions:
-                return session_id
+        while (session_id := fresh_id(self._random_bytes)) in self._sessions or session_id in self._pending:
+            continue
+        return session_id
 
     # ---- out
 
-    def _send(self, message: Message, id_: int, address: Address) -> None:
-        self._outgoing.append((encode_message(message, id_), address))
+    def _send_clear(self, message: Message, id_: int, address: Address) -> None:
+        self._outgoing.append((encode_clear(*encode_body(message), id_), address))
 
     def _push(self, event: ServerEvent) -> None:
         dropped = self._events.push(event)
@@ -323,3 +400,10 @@ class ServerLink:
             self._statuses[dropped.frame.camera_id].counters.overflow += 1
         elif dropped is not None:
             self.rejected["event_overflow"] += 1
+
+
+def _opened(pending: PendingSession, datagram: Buffer) -> bytes | str:
+    """The body of a sealed datagram by the keys of a session that has not begun."""
+    welcome, keys = pending.agreement.welcome, pending.agreement.keys
+    channel = SealedChannel(welcome.cipher, keys.server_control, keys.agent_control, welcome.session_id)
+    return channel.open(datagram)

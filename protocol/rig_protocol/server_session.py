@@ -1,4 +1,4 @@
-"""One camera's session at the server: reassembly, clock, liveness, loss by cause."""
+"""One camera's session at the server: reassembly, clock, stream plan, liveness, loss by cause."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
@@ -9,8 +9,12 @@ from rig_protocol.counters import CameraCounters
 from rig_protocol.datagram import Buffer, FragmentHeader
 from rig_protocol.events import Address
 from rig_protocol.frames import EncodedFrame
-from rig_protocol.messages import ClockReply, ClockRequest, Hello, Welcome
+from rig_protocol.handshake import Agreement
+from rig_protocol.message_bytes import encode_body
+from rig_protocol.messages import ClockReply, Heartbeat, Hello, Message, StreamChoice, StreamPlan
 from rig_protocol.reassembler import Reassembler
+from rig_protocol.sealed_channel import SealedChannel
+from rig_protocol.security import FrameSeal
 
 SILENCE_NS = 2_000_000_000
 # A frame is in the past when it arrives; clocks and their reading err by so much beyond the uncertainty.
@@ -41,23 +45,51 @@ class CameraStatus:
 
 
 class ServerSession:
-    """From the welcome of one camera to its goodbye or silence. Counts into `status`."""
+    """From the first authentic message of one camera to its goodbye or silence. Counts into `status`.
 
-    def __init__(self, status: CameraStatus, hello_nonce: int, welcome: Welcome, now_ns: int) -> None:
+    `due_ns` is never later than the moment at which `handle_timeout` has something to do.
+    """
+
+    def __init__(self, status: CameraStatus, agreement: Agreement, now_ns: int) -> None:
+        welcome, keys = agreement.welcome, agreement.keys
         self.status = status
         self.address = status.address  # a session is bound to it; the status may move on
-        self.hello_nonce = hello_nonce
         self.welcome = welcome
         self.last_heard_ns = now_ns
+        self.choice: StreamChoice | None = None
+        self._channel = SealedChannel(
+            welcome.cipher, keys.server_control, keys.agent_control, welcome.session_id
+        )
         self._clock = ClockSync(now_ns)
-        self._reassembler = Reassembler(welcome.camera_id, status.hello.fps, status.counters)
+        self._reassembler = Reassembler(
+            welcome.camera_id, status.hello.fps, status.counters, FrameSeal(welcome.cipher, keys)
+        )
+        self.due_ns = now_ns
 
     def receive_fragments(
         self, first: FragmentHeader, run: Buffer, count: int, now_ns: int
     ) -> EncodedFrame | None:
         """Take a run of fragments; the frame, in rig time, that it completes and that may be delivered."""
         frame = self._reassembler.receive(first, run, count, now_ns)
-        return None if frame is None else self._accept(frame, now_ns)
+        self.due_ns = min(self.due_ns, self._reassembler.due_ns)
+        if frame is None:
+            return None
+        self.last_heard_ns = now_ns
+        return self._accept(frame, now_ns)
+
+    def open(self, datagram: Buffer, now_ns: int) -> bytes | str:
+        """The body of a sealed datagram, now heard; or the cause (counted) for which it is dropped."""
+        body = self._channel.open(datagram)
+        if not isinstance(body, str):
+            self.last_heard_ns = now_ns
+        elif body in ("bad_seal", "replayed"):
+            counters = self.status.counters
+            setattr(counters, body, getattr(counters, body) + 1)
+        return body
+
+    def seal(self, message: Message) -> bytes:
+        """The datagram of a message to this agent."""
+        return self._channel.seal(*encode_body(message))
 
     def receive_clock_reply(self, reply: ClockReply, now_ns: int) -> None:
         """Take a clock reply into the estimate."""
@@ -67,30 +99,52 @@ class ServerSession:
             counters.bad_clock_reply += 1
         counters.clock_steps += self._clock.steps - steps_before
         self.status.clock = self._clock.estimate
+        self.due_ns = min(self.due_ns, self._clock.next_request_ns)
 
-    def clock_request(self, now_ns: int) -> ClockRequest | None:
-        """The clock request that is due now, if any."""
-        return self._clock.request(now_ns) if self._clock.next_request_ns <= now_ns else None
+    def receive_heartbeat(self, heartbeat: Heartbeat, now_ns: int) -> None:
+        """The agent's gauges, and how many frames it has sent."""
+        self.status.health = heartbeat.health
+        self._reassembler.heard_of(heartbeat.frames, now_ns)
+        self.due_ns = min(self.due_ns, self._reassembler.due_ns)
+
+    def periodic_messages(self, now_ns: int) -> list[bytes]:
+        """The clock request, stamped now, and the stream plan with it, where they are due."""
+        if self._clock.next_request_ns > now_ns:
+            return []
+        plan = self._plan()
+        messages: list[Message] = [self._clock.request(now_ns), *([] if plan is None else [plan])]
+        return [self.seal(message) for message in messages]
 
     def silent(self, now_ns: int) -> bool:
         """True when the agent must be taken as gone."""
         return now_ns - self.last_heard_ns >= SILENCE_NS
 
-    def expire(self, now_ns: int) -> None:
-        """Give up the frames whose time is over."""
-        self._reassembler.expire(now_ns)
+    def handle_timeout(self, now_ns: int) -> list[bytes]:
+        """Give up the frames whose time is over; requests for fragments that are missed."""
+        requests = self._reassembler.handle_timeout(now_ns)
+        self.due_ns = min(
+            self._clock.next_request_ns, self.last_heard_ns + SILENCE_NS, self._reassembler.due_ns
+        )
+        return [self.seal(request) for request in requests]
 
     def close(self) -> None:
         """The session is over: count what it leaves unfinished."""
         self._reassembler.close()
         self.status.connected = False
 
-    @property
-    def next_timeout_ns(self) -> int:
-        """When the session has something to do next."""
-        due_ns = min(self._clock.next_request_ns, self.last_heard_ns + SILENCE_NS)
-        deadline_ns = self._reassembler.next_deadline_ns
-        return due_ns if deadline_ns is None else min(due_ns, deadline_ns)
+    def _plan(self) -> StreamPlan | None:
+        """The choice in the agent's own clock; None without a choice or before its clock is known."""
+        choice, clock = self.choice, self._clock.estimate
+        if choice is None or clock is None:
+            return None
+        slot_ns = choice.step_ns * choice.slot // choice.slots
+        return StreamPlan(
+            color_codec=choice.color_codec,
+            depth_codec=choice.depth_codec,
+            fps=choice.fps,
+            step_ns=choice.step_ns,
+            phase_ns=(slot_ns - clock.offset_ns) % choice.step_ns,
+        )
 
     def _accept(self, frame: EncodedFrame, now_ns: int) -> EncodedFrame | None:
         counters = self.status.counters
@@ -114,6 +168,7 @@ class ServerSession:
         latest_ns = now_ns + _FUTURE_UNCERTAINTIES * uncertainty_ns + _FUTURE_MARGIN_NS
         if not now_ns - MAX_FRAME_AGE_NS <= timestamp_ns <= latest_ns:
             self._clock.hurry()
+            self.due_ns = min(self.due_ns, self._clock.next_request_ns)
             return None
         total_ns = ceil(hypot(uncertainty_ns, frame.uncertainty_ns))
         return replace(frame, timestamp_ns=timestamp_ns, uncertainty_ns=total_ns, received_ns=now_ns)

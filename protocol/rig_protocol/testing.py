@@ -10,6 +10,7 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
 
 from rig_protocol.agent_link import AgentLink
+from rig_protocol.datagram import DatagramBatch
 from rig_protocol.events import Address, AgentEvent, ServerEvent
 from rig_protocol.frames import EncodedFrame
 from rig_protocol.server_link import ServerLink
@@ -153,8 +154,13 @@ class VirtualAgent:
             self.next_frame_ns = now_ns + self.frame_interval_ns
             batch = self.link.send_frame(self.make_frame(self.sequence, agent_ns), agent_ns)
             self.sequence += 1
-            for fragment in batch or ():
-                self.uplink.send(bytes(fragment), now_ns)
+            self._send(batch, now_ns)
+        for again in self.link.frames_to_resend(len):
+            self._send(again, now_ns)
+
+    def _send(self, batch: DatagramBatch | None, now_ns: int) -> None:
+        for fragment in batch or ():
+            self.uplink.send(bytes(fragment), now_ns)
 
 
 class VirtualNetwork:

@@ -68,6 +68,9 @@ def run(
     out: Annotated[
         Path | None, typer.Option(metavar="DIR", help="Folder for the results; else ./calibration.")
     ] = None,
+    insecure: Annotated[
+        bool, typer.Option("--insecure", help="Take frames of anybody: only on an isolated bench.")
+    ] = False,
 ) -> None:
     """Receive the agents' frames and group them into panoramic frames.
 
@@ -81,7 +84,12 @@ def run(
     )
     from rig_server.config import load_rig_settings
 
-    changes = {"listen": listen, "capture": {"frames": frames}, "calibration": {"method": method}}
+    changes = {
+        "listen": listen,
+        "insecure": insecure or None,
+        "capture": {"frames": frames},
+        "calibration": {"method": method},
+    }
     settings = load_rig_settings(config, changes)
     console = Console()
     set_up_logging(settings.log_level, console)
@@ -109,6 +117,29 @@ def init(
 
     write_commented_toml(RigSettings, path, force)
     Console().print(f"wrote {path}; list the cameras in it, then run rig-server", soft_wrap=True)
+
+
+@app.command()
+def keygen(
+    path: Annotated[Path, typer.Option(help="File to write.", metavar="FILE")] = Path("rig.key"),
+    force: Annotated[bool, typer.Option("--force", help="Replace a key: locks out who has it.")] = False,
+) -> None:
+    """Make the rig's key: who holds it may join and watch.
+
+    Copy the file to the PC's and every Pi's /etc/kinect-rig/rig.key (or name it by `key_file`), readable by
+    the service's user alone (mode 0600).
+    """
+    import secrets
+
+    from rig_protocol.key_file import write_key
+    from rig_protocol.rig_key import RigKey
+
+    write_key(path, RigKey.generate(secrets.token_bytes), force)
+    Console().print(
+        f"wrote {path} (mode 0600); copy it to /etc/kinect-rig/rig.key of the PC and of every Pi, "
+        f"for example: scp {path} pi@cam00.local:",
+        soft_wrap=True,
+    )
 
 
 def _open_rig(settings: "RigSettings", simulate: int | None, seed: int | None) -> "Rig":

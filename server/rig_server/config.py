@@ -82,6 +82,10 @@ class RigSettings(Settings):
     """Address and UDP port to receive on."""
     expected_cameras: int | None = Field(None, ge=1, le=MAX_CAMERAS, examples=[12])
     """How many cameras to wait for when none are listed below; unset: as many as come."""
+    key_file: Path | None = Field(None, examples=[Path("/etc/kinect-rig/rig.key")])
+    """The rig's key, as `rig-server keygen` made it; unset: ./rig.key, else /etc/kinect-rig/rig.key."""
+    insecure: bool = False
+    """Take frames of anybody who sends some: only for an isolated bench."""
     receive_buffer_bytes: int = Field(8 << 20, ge=65_536, le=1 << 30)
     """Kernel receive buffer to ask for; the kernel's limit is net.core.rmem_max."""
     decoder_threads: int = Field(2, ge=1, le=64)

@@ -19,6 +19,7 @@ from rig_protocol.events import (
 from rig_protocol.frames import PanoramicFrame
 from rig_protocol.messages import Hello
 from rig_protocol.rig_folder import RigDescription
+from rig_protocol.rig_key import RigKey
 from rig_protocol.roster import Roster, Slot
 from rig_protocol.server_link import ServerLink
 from rig_protocol.server_session import CameraStatus
@@ -45,12 +46,13 @@ class LivePipeline:
     source = "udp"
     ended = False
 
-    def __init__(self, settings: RigSettings) -> None:
+    def __init__(self, settings: RigSettings, key: RigKey) -> None:
         self._settings = settings
         self._assembler = Assembler(_synchroniser(settings))
         self._link = ServerLink(
             _roster(settings),
-            session_id_source=lambda: secrets.randbits(64),
+            key,
+            secrets.token_bytes,
             color_codecs=COLOR_CODECS,
             depth_codecs=DEPTH_CODECS,
         )

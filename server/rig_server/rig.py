@@ -1,6 +1,7 @@
 """Rig: panoramic frames as a Python iterator, live, recorded or simulated alike."""
 
 import re
+import secrets
 import time
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
@@ -9,9 +10,11 @@ from typing import Protocol, Self
 
 from rig_protocol.errors import ConfigurationError, RigError
 from rig_protocol.frames import PanoramicFrame
+from rig_protocol.key_file import rig_key
 from rig_protocol.messages import Hello
 from rig_protocol.poses import Pose
 from rig_protocol.rig_folder import RigDescription
+from rig_protocol.rig_key import RigKey
 from rig_server.config import MAX_CAMERAS, RigSettings, load_rig_settings, parse_address
 from rig_server.metrics import RigStatus
 from rig_server.pipeline import LivePipeline
@@ -102,7 +105,7 @@ class Rig:
     @classmethod
     def live(cls, settings: RigSettings) -> Self:
         """The agents that stream to this machine, at the address that the settings state."""
-        return cls(LivePipeline(settings), settings)
+        return cls(LivePipeline(settings, rig_key(settings.key_file, settings.insecure)), settings)
 
     @classmethod
     def simulated(
@@ -114,8 +117,9 @@ class Rig:
     ) -> Self:
         """A ring of simulated agents: processes of this machine that stream over loopback UDP."""
         settings = simulated_settings(settings or load_rig_settings(None), cameras)
-        pipeline = LivePipeline(settings)
-        return cls(pipeline, settings, Simulation(cameras, seed, fps, pipeline.address))
+        key = RigKey.generate(secrets.token_bytes)
+        pipeline = LivePipeline(settings, key)
+        return cls(pipeline, settings, Simulation(cameras, seed, fps, pipeline.address, key))
 
     def __enter__(self) -> Self:
         """Begin."""

@@ -10,8 +10,10 @@ from pathlib import Path
 
 from rig_protocol.errors import RigError
 from rig_protocol.events import Address
+from rig_protocol.key_file import write_key
 from rig_protocol.poses import Pose
 from rig_protocol.rig_folder import read_true_poses
+from rig_protocol.rig_key import RigKey
 from rig_server.config import RigSettings, RingSettings
 
 _libc = ctypes.CDLL(None, use_errno=True)  # loaded here: nothing may be loaded between fork and exec
@@ -44,16 +46,18 @@ class Simulation:
     started them, so start a simulation on a thread that outlives it.
     """
 
-    def __init__(self, cameras: int, seed: int, fps: float, server: Address) -> None:
+    def __init__(self, cameras: int, seed: int, fps: float, server: Address, rig_key: RigKey) -> None:
         self._cameras = cameras
         self._seed = seed
         self._fps = fps
         self._server = server
+        self._rig_key = rig_key
         self._folder = tempfile.TemporaryDirectory(prefix="rig-simulation-")
         self._agents: dict[int, subprocess.Popen[bytes]] = {}
 
     def start(self) -> None:
         """Start the agents; RigError when the system refuses."""
+        write_key(self._key_file, self._rig_key)
         for camera_id in range(self._cameras):
             self._agents[camera_id] = self._start_agent(camera_id)
 
@@ -93,6 +97,7 @@ class Simulation:
             "--seed": self._seed,
             "--fps": self._fps,
             "--server": f"{host}:{port}",
+            "--key-file": self._key_file,
         }
         if camera_id == 0:
             options["--truth-out"] = self._truth_file
@@ -113,6 +118,10 @@ class Simulation:
         path = Path(self._folder.name) / "agent.toml"
         path.touch()
         return path
+
+    @property
+    def _key_file(self) -> Path:
+        return Path(self._folder.name) / "rig.key"
 
     @property
     def _truth_file(self) -> Path:

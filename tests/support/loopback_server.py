@@ -1,7 +1,6 @@
 """A server on loopback for tests of the agent: the real link behind a plain socket, in a thread."""
 
-import itertools
-import os
+import secrets
 import select
 import socket
 import threading
@@ -13,6 +12,7 @@ from typing import Self, TypeVar
 from rig_protocol.codecs import COLOR_CODECS, DEPTH_CODECS
 from rig_protocol.events import Address, FrameReceived, ServerEvent
 from rig_protocol.frames import EncodedFrame
+from rig_protocol.rig_key import RigKey
 from rig_protocol.roster import Roster
 from rig_protocol.server_link import ServerLink
 
@@ -23,7 +23,12 @@ _PATIENCE_S = 20.0
 class LoopbackServer:
     """Keeps every event; `wait_for` awaits one. `stop(silently=True)` dies without a goodbye."""
 
-    def __init__(self, address: Address = ("127.0.0.1", 0), roster: Roster | None = None) -> None:
+    def __init__(
+        self,
+        address: Address = ("127.0.0.1", 0),
+        roster: Roster | None = None,
+        rig_key: RigKey = RigKey.INSECURE,
+    ) -> None:
         """Listen from now on; an open roster unless another one is given."""
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
@@ -31,8 +36,9 @@ class LoopbackServer:
         self._socket.bind(address)
         self._socket.setblocking(False)
         self.address: Address = self._socket.getsockname()
-        ids = itertools.count(int.from_bytes(os.urandom(7)) + 1)
-        self._link = ServerLink(roster or Roster(open=True), lambda: next(ids), COLOR_CODECS, DEPTH_CODECS)
+        self._link = ServerLink(
+            roster or Roster(open=True), rig_key, secrets.token_bytes, COLOR_CODECS, DEPTH_CODECS
+        )
         self.events: list[ServerEvent] = []
         self._changed = threading.Condition()
         self._stopping = threading.Event()

@@ -1,20 +1,26 @@
 """Real agents and servers as processes, real sockets on loopback, and waiting for what they do."""
 
+import atexit
 import re
+import secrets
 import signal
 import socket
 import subprocess
 import sys
+import tempfile
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from functools import cache
 from pathlib import Path
 
 import numpy as np
 
 from rig_protocol.camera import CameraModel
 from rig_protocol.frames import PanoramicFrame, RgbdFrame
+from rig_protocol.key_file import write_key
 from rig_protocol.rig_folder import CameraEntry, RigDescription, RingDrawing, write_rig_folder
+from rig_protocol.rig_key import RigKey
 from rig_server import Rig
 from rig_server.config import CameraSettings, RigSettings
 
@@ -33,7 +39,17 @@ def free_port() -> int:
 def server_settings(port: int, cameras: int, **changes: object) -> RigSettings:
     """A server on loopback that expects so many cameras."""
     listed = tuple(CameraSettings(id=i) for i in range(cameras))
-    return RigSettings.model_validate({"listen": f"{LOOPBACK}:{port}", "cameras": listed, **changes})
+    options = {"listen": f"{LOOPBACK}:{port}", "cameras": listed, "key_file": rig_key_file()}
+    return RigSettings.model_validate(options | changes)
+
+
+@cache
+def rig_key_file() -> Path:
+    """The key that servers and agents of one test run share."""
+    folder = tempfile.TemporaryDirectory(prefix="rig-key-")
+    atexit.register(folder.cleanup)
+    write_key(path := Path(folder.name) / "rig.key", RigKey.generate(secrets.token_bytes))
+    return path
 
 
 class AgentProcess:
@@ -45,6 +61,7 @@ class AgentProcess:
         self._log, self._env = log, env
         self._words = [
             *(sys.executable, "-m", "rig_agent.cli", "--server", f"{LOOPBACK}:{port}"),
+            *("--key-file", str(rig_key_file())),
             *map(str, options),
         ]
         self._process: subprocess.Popen[bytes] | None = None

@@ -1,7 +1,7 @@
 """An agent in a thread of the test: tiny frames over real loopback UDP, through the protocol's own link."""
 
 import contextlib
-import random
+import secrets
 import socket
 import threading
 import time
@@ -16,6 +16,7 @@ from rig_protocol.codecs import codec_by_name
 from rig_protocol.events import Address
 from rig_protocol.frames import EncodedFrame, Payload
 from rig_protocol.messages import Hello
+from rig_protocol.rig_key import RigKey
 
 FPS = 50.0
 COLOR, DEPTH = codec_by_name("bayer-uncompressed"), codec_by_name("disparity-uncompressed")
@@ -40,7 +41,7 @@ class SmallAgent:
             software="test",
         )
         self.camera_id, self.silent = camera_id, silent
-        self._link = AgentLink(hello, nonce_source=lambda: random.getrandbits(63) + 1)
+        self._link = AgentLink(hello, RigKey.INSECURE, secrets.token_bytes)
         self._link.report_health({"temperature_c": 50.0 + camera_id})
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
         self._socket.connect(server)

@@ -10,10 +10,12 @@ from rig_protocol.camera import CameraModel
 from rig_protocol.events import Address
 from rig_protocol.frames import EncodedFrame, Payload
 from rig_protocol.messages import Hello
+from rig_protocol.rig_key import RigKey
 from rig_protocol.roster import Roster
 from rig_protocol.server_link import ServerLink
 
 COLOR, DEPTH = 2, 5
+KEY = RigKey(bytes(range(32)))
 AGENT: Address = ("192.0.2.1", 40001)
 OTHER: Address = ("192.0.2.2", 40002)
 SECOND_NS = 1_000_000_000
@@ -51,21 +53,26 @@ def make_frame(sequence: int = 0, timestamp_ns: int = T0, size: int = 4000, **ch
     return replace(frame, **changes)
 
 
-def numbers(seed: int) -> Callable[[], int]:
-    """A seeded source of 64-bit numbers."""
-    generator = random.Random(seed)
-    return lambda: generator.getrandbits(64)
+def random_bytes(seed: int) -> Callable[[int], bytes]:
+    """A seeded source of bytes."""
+    return random.Random(seed).randbytes
 
 
 def make_server(roster: Roster | None = None, seed: int = 1, **changes: Any) -> ServerLink:
     """A server that takes every camera, unless a roster says otherwise."""
-    options: dict[str, Any] = {"color_codecs": (COLOR,), "depth_codecs": (DEPTH,), **changes}
-    return ServerLink(roster or Roster(open=True), session_id_source=numbers(seed), **options)
+    options: dict[str, Any] = {
+        "rig_key": KEY,
+        "random_bytes": random_bytes(seed),
+        "color_codecs": (COLOR,),
+        "depth_codecs": (DEPTH,),
+    }
+    return ServerLink(roster or Roster(open=True), **(options | changes))
 
 
 def make_agent(hello: Hello | None = None, seed: int = 2, **changes: Any) -> AgentLink:
     """An agent's link."""
-    return AgentLink(hello or make_hello(), nonce_source=numbers(seed), **changes)
+    options: dict[str, Any] = {"rig_key": KEY, "random_bytes": random_bytes(seed)}
+    return AgentLink(hello or make_hello(), **(options | changes))
 
 
 def roundtrip(agent: AgentLink, server: ServerLink, address: Address = AGENT, now_ns: int = T0) -> None:
@@ -73,6 +80,7 @@ def roundtrip(agent: AgentLink, server: ServerLink, address: Address = AGENT, no
     for _ in range(4):
         for datagram in agent.datagrams_to_send(now_ns):
             server.receive_datagram(datagram, address, now_ns)
+        server.handle_timeout(now_ns)
         for datagram, to in server.datagrams_to_send(now_ns):
             if to == address:
                 agent.receive_datagram(datagram, now_ns)
