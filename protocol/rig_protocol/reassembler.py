@@ -292,7 +292,7 @@ class Reassembler:
         for k, spare in enumerate(self._spare):
             if size <= len(spare):
                 return self._spare.pop(k)
-        return bytearray(size + size // 8)
+        return bytearray(min(size + size // 8, MAX_SEALED_SIZE))
 
     def _recycle(self, unit: OpenUnit) -> None:
         if len(self._spare) == _MAX_SPARE:
