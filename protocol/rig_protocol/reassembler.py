@@ -165,7 +165,10 @@ class Reassembler:
 
     def _miss_before(self, number: int, now_ns: int) -> None:
         """All frames below `number` were sent: what has not come of them is missed."""
+        begun = {key.frame_number for key in self._open}
         for unseen in range(max(self._next_number, number - NUMBER_WINDOW), number):
+            if unseen in begun or unseen in self._given_up:  # its number came far ahead, and was not believed
+                continue
             deadline_ns = now_ns + self._interval_ns + GRACE_NS
             self._unseen[unseen] = _Unseen(now_ns + REORDER_NS, deadline_ns)
             self._wake_at(now_ns + REORDER_NS)
