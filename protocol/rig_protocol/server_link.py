@@ -280,9 +280,12 @@ class ServerLink:
 
     def _take_hello(self, prefix: Prefix, datagram: Buffer, address: Address, now_ns: int) -> Reject | None:
         """Answer a hello, or say why not. Nothing but a bounded table changes before the agent confirms."""
-        known = self._pending.of_nonce(prefix.id)
-        if known is not None or self._pending.was_used(prefix.id):
-            self._answer_copy(known, address)
+        if self._pending.was_used(prefix.id):
+            self.rejected["stale_hello"] += 1  # a copy of an old one
+            return None
+        known = self._pending.of_hello(prefix.id, address)
+        if known is not None:
+            self._outgoing.append((known.welcome_datagram, address))  # our answer was lost
             return None
         try:
             hello = open_hello(datagram, prefix.id, self._rig_key)
@@ -321,13 +324,6 @@ class ServerLink:
             return
         self._pending.add(PendingSession(hello, nonce, address, agreement, answer))
         self._outgoing.append((answer, address))
-
-    def _answer_copy(self, known: PendingSession | None, address: Address) -> None:
-        """A hello came again: our answer to it was lost, or it is a copy of an old one."""
-        if known is not None and known.address == address:
-            self._outgoing.append((known.welcome_datagram, address))
-        else:
-            self.rejected["stale_hello"] += 1
 
     def _confirm(self, prefix: Prefix, datagram: Buffer, address: Address, now_ns: int) -> None:
         """The first sealed message of a session proves that its agent is there: the session begins."""
