@@ -66,8 +66,10 @@ from rig_protocol.server_session import CameraStatus, ServerSession
 
 _NOTICE_INTERVAL_NS = 100_000_000  # to one address
 _NOTICE_INTERVAL_ALL_NS = 5_000_000
-# A key agreement costs 0.1 ms: so many a second are 1 % of a core, and join a rig in a tenth of a second.
+# A key agreement costs 0.1 ms: so many a second are 1 % of a core.
 _HANDSHAKE_INTERVAL_NS = 10_000_000
+# Agents that lost their server in the same moment ask for it in step: all of them are to be answered at once.
+_HANDSHAKE_BURST = 32
 _REFUSAL_EVENT_INTERVAL_NS = 1_000_000_000
 # Answers wait for one turn of the shell; a flood of hellos beyond this loses its oldest answers.
 _MAX_OUTGOING = 1024
@@ -107,7 +109,7 @@ class ServerLink:
         self._outgoing: deque[tuple[bytes, Address]] = deque(maxlen=_MAX_OUTGOING)
         self._notices = RateLimit(_NOTICE_INTERVAL_NS)
         self._all_notices = RateLimit(_NOTICE_INTERVAL_ALL_NS, max_keys=1)
-        self._handshakes = RateLimit(_HANDSHAKE_INTERVAL_NS, max_keys=1)
+        self._handshakes = RateLimit(_HANDSHAKE_INTERVAL_NS, max_keys=1, burst=_HANDSHAKE_BURST)
         self._refusal_events = RateLimit(_REFUSAL_EVENT_INTERVAL_NS)
 
     @property
