@@ -161,10 +161,13 @@ class ServerLink:
         self._due_ns = min((session.due_ns for session in self._sessions.values()), default=None)
 
     def plan_stream(self, camera_id: int, choice: StreamChoice) -> None:
-        """What a connected camera is to send from now on; told with its next clock request."""
+        """What a connected camera is to send from now on; told with its next clock request.
+
+        LinkUsageError for a choice that no plan can tell.
+        """
         session = self._holder(camera_id)
         if session is not None:
-            session.choice = choice
+            session.choose(choice)
 
     def next_event(self) -> ServerEvent | None:
         """The oldest event that was not fetched yet, or None."""

@@ -4,7 +4,7 @@ from collections.abc import Iterable
 from dataclasses import replace
 from typing import Any
 
-from rig_protocol.datagram import Buffer, DatagramBatch, parse_prefix
+from rig_protocol.datagram import Buffer, DatagramBatch, MessageType, parse_prefix
 from rig_protocol.fragmenter import fragment
 from rig_protocol.frames import EncodedFrame
 from rig_protocol.handshake import AgentHandshake, Agreement, answer_hello, open_hello
@@ -62,8 +62,12 @@ class ServerPeer:
 
     def seal(self, message: Message) -> bytes:
         """The datagram of a message to the agent."""
+        return self.seal_body(*encode_body(message))
+
+    def seal_body(self, message_type: MessageType, body: bytes) -> bytes:
+        """The datagram of any body."""
         assert self._channel is not None
-        return self._channel.seal(*encode_body(message))
+        return self._channel.seal(message_type, body)
 
     def read(self, datagrams: Iterable[bytes]) -> list[Message]:
         """What the agent's sealed datagrams say."""
@@ -93,7 +97,7 @@ class AgentPeer:
         """The datagram of a message to the server."""
         return self.seal_body(*encode_body(message))
 
-    def seal_body(self, message_type: Any, body: bytes) -> bytes:
+    def seal_body(self, message_type: MessageType, body: bytes) -> bytes:
         """The datagram of any body."""
         assert self._channel is not None
         return self._channel.seal(message_type, body)
