@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 
 from rig_protocol.clear_datagram import clear_crc
 from rig_protocol.datagram import MessageType
-from rig_protocol.events import CameraJoined, FrameReceived, Rejected
+from rig_protocol.events import CameraJoined, FrameReceived, HelloRefused, Rejected
 from rig_protocol.messages import ClockReply, ClockRequest, Heartbeat, StreamPlan
 from rig_protocol.sealed_channel import ReplayWindow
 from rig_protocol.security import Cipher
@@ -43,6 +43,7 @@ def test_a_hello_of_which_any_bit_is_altered_begins_nothing() -> None:
     for count, harmed in enumerate(alterations(AgentPeer().hello), start=1):
         server.receive_datagram(harmed, AGENT, T0 + count * 100_000_000)
         assert server.rejected.total() == count
+        assert {type(event) for event in events_of(server)} <= {HelloRefused}
         assert {answer[3] for answer, _ in server.datagrams_to_send(T0)} <= REFUSALS
     assert len(server._pending._by_id) == 0
 
