@@ -300,9 +300,11 @@ def test_a_batch_has_the_same_effect_as_its_datagrams_alone(
     together, alone = make_server(), make_server()
     for server in (together, alone):
         roundtrip(make_agent(), server)
-    [session_id] = together._sessions  # the seeds are the same: so is the id
+    [session] = together._sessions  # the seeds are the same: so is the id
     headers = [
-        header._replace(session_id=session_id, fragment_index=(header.fragment_index + k) % 65536)
+        header._replace(
+            session_id=session.welcome.session_id, fragment_index=(header.fragment_index + k) % 65536
+        )
         for header, length in items
         for k in range(length)
     ]

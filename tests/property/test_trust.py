@@ -45,7 +45,7 @@ def test_a_hello_of_which_any_bit_is_altered_begins_nothing() -> None:
         assert server.rejected.total() == count
         assert {type(event) for event in events_of(server)} <= {HelloRefused}
         assert {answer[3] for answer, _ in server.datagrams_to_send(T0)} <= REFUSALS
-    assert len(server._pending._by_id) == 0
+    assert len(server._reception._pending._by_id) == 0
 
 
 def test_a_welcome_of_which_any_bit_is_altered_is_not_followed() -> None:

@@ -215,7 +215,7 @@ def test_a_flood_of_recorded_hellos_costs_a_bounded_table_and_a_hundred_handshak
         answered += [now_ns for _, to in server.datagrams_to_send(now_ns) if to == OTHER]
     assert sum(now_ns >= T0 + SECOND_NS // 2 for now_ns in answered) == 50
     assert len(answered) <= 100 + 32  # what was saved up before
-    assert len(server._pending._by_id) == len(server._pending._ids) == MAX_PENDING
+    assert len(server._reception._pending._by_id) == len(server._reception._pending._ids) == MAX_PENDING
     assert server.rejected == {"handshake_limit": 1000 - len(answered)}
     server.receive_datagram(live.seal(Heartbeat({"still": 1.0})), AGENT, now_ns)
     assert server.cameras[0].health == {"still": 1.0}

@@ -1,0 +1,185 @@
+"""The server towards those who have no session: hellos, refusals, notices, and who may begin one.
+
+Rules: protocol/SPEC.md, sections 5 and 6.
+"""
+
+from collections import Counter
+from collections.abc import Callable
+from dataclasses import dataclass
+
+from rig_protocol.admission import (
+    choose_codecs,
+    duplicate_slot,
+    gives_way,
+    malformed_hello,
+    version_mismatch,
+    wrong_key,
+)
+from rig_protocol.clear_datagram import clear_crc, encode_clear
+from rig_protocol.datagram import VERSION, Buffer, Prefix
+from rig_protocol.errors import DataError
+from rig_protocol.events import Address, HelloRefused
+from rig_protocol.handshake import NotAuthentic, answer_hello, fresh_id, open_hello
+from rig_protocol.message_bytes import MIN_HELLO_SIZE, encode_body
+from rig_protocol.messages import Hello, Reject, UnknownSession, Welcome
+from rig_protocol.pending_sessions import PendingSession, PendingSessions
+from rig_protocol.rate_limit import RateLimit
+from rig_protocol.rig_key import RigKey
+from rig_protocol.roster import Roster
+from rig_protocol.sealed_channel import SealedChannel
+from rig_protocol.security import RandomBytes
+from rig_protocol.session_table import SessionTable
+
+_NOTICE_INTERVAL_NS = 100_000_000  # to one address
+_NOTICE_INTERVAL_ALL_NS = 5_000_000
+# A key agreement costs 0.1 ms: so many a second are 1 % of a core.
+_HANDSHAKE_INTERVAL_NS = 10_000_000
+# Agents that lost their server in the same moment ask for it in step: all of them are to be answered at once.
+_HANDSHAKE_BURST = 32
+_REFUSAL_EVENT_INTERVAL_NS = 1_000_000_000
+
+
+@dataclass(frozen=True, slots=True)
+class Terms:
+    """What a server offers every agent."""
+
+    color_codecs: tuple[int, ...]
+    depth_codecs: tuple[int, ...]
+    datagram_size: int
+
+
+class Reception:
+    """Answers hellos. Nothing but a bounded table changes before an agent has proved to be there."""
+
+    def __init__(
+        self,
+        roster: Roster,
+        rig_key: RigKey,
+        random_bytes: RandomBytes,
+        terms: Terms,
+        sessions: SessionTable,
+        rejected: Counter[str],
+        send: Callable[[bytes, Address], None],
+        tell: Callable[[HelloRefused], None],
+    ) -> None:
+        """Looks at `sessions`, counts into `rejected`."""
+        self._roster, self._terms, self._sessions = roster, terms, sessions
+        self._rig_key, self._random_bytes = rig_key, random_bytes
+        self._rejected, self._send, self._tell = rejected, send, tell
+        self._closed = False
+        self._pending = PendingSessions()
+        self._notices = RateLimit(_NOTICE_INTERVAL_NS)
+        self._all_notices = RateLimit(_NOTICE_INTERVAL_ALL_NS, max_keys=1)
+        self._handshakes = RateLimit(_HANDSHAKE_INTERVAL_NS, max_keys=1, burst=_HANDSHAKE_BURST)
+        self._refusal_events = RateLimit(_REFUSAL_EVENT_INTERVAL_NS)
+
+    def __contains__(self, session_id: int) -> bool:
+        """True for a session that was offered and has not begun."""
+        return session_id in self._pending
+
+    def close(self) -> None:
+        """Welcome nobody any more."""
+        self._closed = True
+        self._pending.clear()
+
+    def receive_hello(self, prefix: Prefix, datagram: Buffer, address: Address, now_ns: int) -> None:
+        """Take a datagram whose prefix says HELLO, of whatever version."""
+        if self._closed:
+            self._rejected["closed"] += 1
+        elif len(datagram) < MIN_HELLO_SIZE or prefix.id == 0:
+            self._rejected["malformed"] += 1
+        elif prefix.crc != clear_crc(datagram):
+            self._rejected["corrupt_control"] += 1
+        elif prefix.version != VERSION:
+            self._refuse(version_mismatch(prefix.version), prefix.id, address, now_ns)
+        else:
+            refusal = self._take_hello(prefix.id, datagram, address, now_ns)
+            if refusal is not None:
+                self._refuse(refusal, prefix.id, address, now_ns)
+
+    def confirm(self, session_id: int, datagram: Buffer, address: Address) -> PendingSession | None:
+        """The offered session whose agent a first sealed message proves to be there; None (counted) else."""
+        pending = self._pending.of_id(session_id)
+        if pending is None or pending.address != address:
+            self._rejected["wrong_address"] += 1
+            return None
+        if isinstance(_opened(pending, datagram), str):
+            self._rejected["bad_seal"] += 1
+            return None
+        self._pending.take(session_id)
+        return pending
+
+    def notify_unknown(self, session_id: int, address: Address, now_ns: int) -> None:
+        """Tell a sender that it has no session here, now and then."""
+        if session_id not in self._pending and self._may_notify(address, now_ns):
+            self._send(encode_clear(*encode_body(UnknownSession()), session_id), address)
+
+    def _take_hello(self, nonce: int, datagram: Buffer, address: Address, now_ns: int) -> Reject | None:
+        """Answer a hello, or say why not."""
+        if self._pending.was_used(nonce):
+            self._rejected["stale_hello"] += 1  # a copy of an old one
+            return None
+        known = self._pending.of_hello(nonce, address)
+        if known is not None:
+            self._send(known.welcome_datagram, address)  # our answer was lost
+            return None
+        try:
+            hello = open_hello(datagram, nonce, self._rig_key)
+        except NotAuthentic:
+            return wrong_key(self._rig_key.is_public)
+        except DataError as error:
+            return malformed_hello(error)
+        welcome = self._choose(hello, address, now_ns)
+        if isinstance(welcome, Reject):
+            return welcome
+        if self._handshakes.allows("all", now_ns):
+            self._answer(nonce, datagram, hello, welcome, address)
+        else:  # the agent tries again in a moment
+            self._rejected["handshake_limit"] += 1
+        return None
+
+    def _choose(self, hello: Hello, address: Address, now_ns: int) -> Welcome | Reject:
+        sessions, terms = self._sessions, self._terms
+        camera_id = self._roster.assign(
+            hello, sessions.recall(hello, address), sessions.taken(hello, address)
+        )
+        if isinstance(camera_id, Reject):
+            return camera_id
+        holder = sessions.of_camera(camera_id)
+        if holder is not None and not gives_way(holder, hello, address, now_ns):
+            return duplicate_slot(holder, hello, now_ns)
+        codecs = choose_codecs(hello, terms.color_codecs, terms.depth_codecs)
+        if isinstance(codecs, Reject):
+            return codecs
+        return Welcome(self._new_session_id(), camera_id, *codecs, terms.datagram_size, hello.ciphers[0])
+
+    def _answer(self, nonce: int, datagram: Buffer, hello: Hello, welcome: Welcome, address: Address) -> None:
+        try:
+            answer, agreement = answer_hello(datagram, nonce, welcome, self._rig_key, self._random_bytes)
+        except DataError:
+            self._rejected["malformed"] += 1
+            return
+        self._pending.add(PendingSession(hello, nonce, address, agreement, answer))
+        self._send(answer, address)
+
+    def _refuse(self, reject: Reject, nonce: int, address: Address, now_ns: int) -> None:
+        self._rejected[f"refused_{reject.reason.name.lower()}"] += 1
+        if self._may_notify(address, now_ns):
+            self._send(encode_clear(*encode_body(reject), nonce), address)
+        if self._refusal_events.allows(address, now_ns):
+            self._tell(HelloRefused(address, reject.reason, reject.text))
+
+    def _may_notify(self, address: Address, now_ns: int) -> bool:
+        return self._notices.allows(address, now_ns) and self._all_notices.allows("all", now_ns)
+
+    def _new_session_id(self) -> int:
+        while (session_id := fresh_id(self._random_bytes)) in self._sessions or session_id in self._pending:
+            continue
+        return session_id
+
+
+def _opened(pending: PendingSession, datagram: Buffer) -> bytes | str:
+    """The body of a sealed datagram by the keys of a session that has not begun."""
+    welcome, keys = pending.agreement.welcome, pending.agreement.keys
+    channel = SealedChannel(welcome.cipher, keys.server_control, keys.agent_control, welcome.session_id)
+    return channel.open(datagram)
