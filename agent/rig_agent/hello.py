@@ -2,6 +2,7 @@
 
 from importlib.metadata import version
 
+from rig_agent.cipher_choice import ciphers_by_speed
 from rig_agent.config import AgentSettings, Manner
 from rig_agent.sources.base import SourceDescription
 from rig_protocol.codecs import Codec, ImageKind, codec, codecs_for
@@ -29,6 +30,7 @@ def make_hello(settings: AgentSettings, source: SourceDescription) -> Hello:
         depth_codecs=_offer(source.depth_image, settings.depth),
         fps=min(source.fps, settings.fps or source.fps),
         software=f"kinect-rig {version('kinect-rig')}",
+        ciphers=ciphers_by_speed(),
     )
 
 

@@ -21,6 +21,8 @@ _log = logging.getLogger(__name__)
 _REOPEN_NS = 5_000_000_000
 _NO_NETWORK_RETRY_NS = 1_000_000_000
 _ONE_FRAME_NS = 33_333_333
+# Within a burst the kernel may send so much quicker than on average: bursts end well before the next one.
+_BURST_HASTE = 4.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -54,6 +56,7 @@ class Uplink:
         self._full_interval_ns = _ONE_FRAME_NS
         self._reopen_ns = 0
         self._refusal = ""
+        self._rate = 1.0  # bytes a second that the kernel may send
         self.connections = 0
         self.unheard = 0
 
@@ -117,6 +120,7 @@ class Uplink:
             return
         for given_up in self._pacer.submit(batch, now_ns):
             self._link.give_up_frame(given_up)
+        self._limit_rate(batch.total_bytes)
 
     def serve(self, now_ns: int) -> None:
         """Receive what came, do what is due, send what is due."""
@@ -170,6 +174,13 @@ class Uplink:
         self._pacer.grid = None if plan is None else BurstGrid(plan.step_ns, plan.phase_ns)
         planned_ns = 0 if plan is None else round(1e9 / plan.fps)
         self._pacer.interval_ns = max(self._full_interval_ns, planned_ns)
+
+    def _limit_rate(self, frame_bytes: int) -> None:
+        """Tell the kernel when the frames' rate has changed by a quarter."""
+        rate = _BURST_HASTE * frame_bytes * 1e9 / self._pacer.interval_ns
+        if not 0.8 < rate / self._rate < 1.25:
+            self._rate = rate
+            self._transport.limit_rate(rate)
 
     def _say_goodbye(self, now_ns: int) -> None:
         self._pacer.clear()
