@@ -73,8 +73,8 @@ class Transport:
     def limit_rate(self, bytes_per_s: float) -> None:
         """Let the kernel space the datagrams of a burst (SO_MAX_PACING_RATE).
 
-        Works where the interface has the `fq` discipline; elsewhere Linux takes the option and ignores it, and
-        our own pacing is all there is.
+        Works where the interface has the `fq` discipline; elsewhere Linux takes the option and ignores it,
+        and our own pacing is all there is.
         """
         self._rate = int(bytes_per_s)
         if self._socket is not None:

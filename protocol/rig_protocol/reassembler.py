@@ -39,6 +39,8 @@ _MAX_FRAGMENTS = 2**16
 # Buffers of units that are done, for those to come: a camera has one or two open at a time.
 _MAX_SPARE = 2
 _NEVER_NS = 2**63 - 1
+# NumPy's fixed cost pays from about so many payloads on.
+_FEW = 10
 
 
 class _UnitKey(NamedTuple):
@@ -304,10 +306,13 @@ def _fits(first: FragmentHeader, count: int, size: int) -> bool:
 
 
 def _copy(run: Buffer, count: int, content: bytearray, offset: int, size: int) -> None:
-    """Payloads of a run into their place: one strided copy."""
-    if count == 1:
-        content[offset : offset + size] = memoryview(run)[FRAGMENT_HEADER_SIZE:]
+    """Payloads of a run into their place: one by one where they are few, else in one strided copy."""
+    if count <= _FEW:
+        place, source = memoryview(content), memoryview(run)
+        for start in range(FRAGMENT_HEADER_SIZE, len(run), FRAGMENT_HEADER_SIZE + size):
+            place[offset : offset + size] = source[start : start + size]
+            offset += size
         return
     rows = np.frombuffer(run, dtype=np.uint8).reshape(count, FRAGMENT_HEADER_SIZE + size)
-    place = np.frombuffer(content, dtype=np.uint8, count=count * size, offset=offset).reshape(count, size)
-    place[:] = rows[:, FRAGMENT_HEADER_SIZE:]
+    target = np.frombuffer(content, dtype=np.uint8, count=count * size, offset=offset)
+    target.reshape(count, size)[:] = rows[:, FRAGMENT_HEADER_SIZE:]
