@@ -22,3 +22,22 @@ class RateLimit:
         if len(self._last_ns) > self._max_keys:
             self._last_ns.popitem(last=False)
         return True
+
+
+class TokenBucket:
+    """Allows `burst` events at once, and one an interval in the long run."""
+
+    def __init__(self, interval_ns: int, burst: int) -> None:
+        self._interval_ns = interval_ns
+        self._saved_ns = self._most_ns = interval_ns * burst
+        self._last_ns: int | None = None
+
+    def allows(self, now_ns: int) -> bool:
+        """True, and spent, while something is saved."""
+        elapsed_ns = 0 if self._last_ns is None else max(0, now_ns - self._last_ns)
+        self._last_ns = now_ns
+        self._saved_ns = min(self._saved_ns + elapsed_ns, self._most_ns)
+        if self._saved_ns < self._interval_ns:
+            return False
+        self._saved_ns -= self._interval_ns
+        return True

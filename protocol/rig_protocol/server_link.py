@@ -57,7 +57,7 @@ from rig_protocol.messages import (
     Welcome,
 )
 from rig_protocol.pending_sessions import PendingSession, PendingSessions
-from rig_protocol.rate_limit import RateLimit
+from rig_protocol.rate_limit import RateLimit, TokenBucket
 from rig_protocol.rig_key import RigKey
 from rig_protocol.roster import Roster
 from rig_protocol.sealed_channel import SealedChannel
@@ -66,8 +66,9 @@ from rig_protocol.server_session import CameraStatus, ServerSession
 
 _NOTICE_INTERVAL_NS = 100_000_000  # to one address
 _NOTICE_INTERVAL_ALL_NS = 5_000_000
-# A key agreement costs 0.1 ms: so many a second are 1 % of a core, and join a rig in a tenth of a second.
+# A key agreement costs 0.1 ms: 100 a second are 1 % of a core. Whole rigs join at once.
 _HANDSHAKE_INTERVAL_NS = 10_000_000
+_HANDSHAKES_AT_ONCE = 64
 _REFUSAL_EVENT_INTERVAL_NS = 1_000_000_000
 # Answers wait for one turn of the shell; a flood of hellos beyond this loses its oldest answers.
 _MAX_OUTGOING = 1024
@@ -107,7 +108,7 @@ class ServerLink:
         self._outgoing: deque[tuple[bytes, Address]] = deque(maxlen=_MAX_OUTGOING)
         self._notices = RateLimit(_NOTICE_INTERVAL_NS)
         self._all_notices = RateLimit(_NOTICE_INTERVAL_ALL_NS, max_keys=1)
-        self._handshakes = RateLimit(_HANDSHAKE_INTERVAL_NS, max_keys=1)
+        self._handshakes = TokenBucket(_HANDSHAKE_INTERVAL_NS, _HANDSHAKES_AT_ONCE)
         self._refusal_events = RateLimit(_REFUSAL_EVENT_INTERVAL_NS)
 
     @property
@@ -293,7 +294,7 @@ class ServerLink:
         welcome = self._choose(hello, address, now_ns)
         if isinstance(welcome, Reject):
             return welcome
-        if self._handshakes.allows("all", now_ns):
+        if self._handshakes.allows(now_ns):
             self._answer_hello(prefix.id, datagram, hello, welcome, address)
         else:  # the agent tries again in a moment
             self.rejected["handshake_limit"] += 1
