@@ -64,8 +64,9 @@ class Pacer:
             return []
         given_up = [] if self._waiting is None else [self._waiting]
         self._waiting = batch
-        stale = now_ns - self._started_ns > _STALE_INTERVALS * self.interval_ns
-        if self._position == 0 or stale:
+        age_ns = now_ns - self._started_ns
+        fresh = -self.interval_ns <= age_ns <= _STALE_INTERVALS * self.interval_ns  # else the clock jumped
+        if self._position == 0 or not fresh:
             given_up.append(self._current)
             self._advance(now_ns)
         self.counters.dropped += len(given_up)
@@ -103,7 +104,7 @@ class Pacer:
 
     def next_resend(self, now_ns: int) -> DatagramBatch | None:
         """Datagrams to send again now, at most one burst a step, or None."""
-        if not self._resends or now_ns < self._resend_due_ns:
+        if not self._resends or 0 < self._resend_due_ns - now_ns <= self.interval_ns:
             return None
         batch = self._resends.popleft()
         if len(batch) > self._burst:

@@ -66,6 +66,8 @@ from rig_protocol.server_session import CameraStatus, ServerSession
 
 _NOTICE_INTERVAL_NS = 100_000_000  # to one address
 _NOTICE_INTERVAL_ALL_NS = 5_000_000
+# A rig clock that reads so much less than before has been set back: no time of a session means anything.
+_BACKWARD_STEP_NS = 1_000_000_000
 # A key agreement costs 0.1 ms: 100 a second are 1 % of a core. Whole rigs join at once.
 _HANDSHAKE_INTERVAL_NS = 10_000_000
 _HANDSHAKES_AT_ONCE = 64
@@ -103,6 +105,7 @@ class ServerLink:
         self._sessions: dict[int, ServerSession] = {}  # by session id
         self._pending = PendingSessions()
         self._clock_due: list[ServerSession] = []
+        self._latest_ns = 0
         self._due_ns: int | None = None  # never later than what is due; None: nobody is connected
         self._events = EventQueue()
         self._outgoing: deque[tuple[bytes, Address]] = deque(maxlen=_MAX_OUTGOING)
@@ -118,6 +121,7 @@ class ServerLink:
 
     def receive_batch(self, batch: DatagramBatch, address: Address, now_ns: int) -> None:
         """Take datagrams of one sender; the buffer may be reused after the call."""
+        self._check_clock(now_ns)
         if 0 < len(batch.buffer) <= batch.segment_size:
             self._receive(batch.buffer, address, now_ns)
             return
@@ -130,6 +134,7 @@ class ServerLink:
 
     def receive_datagram(self, data: Buffer, address: Address, now_ns: int) -> None:
         """Take one datagram."""
+        self._check_clock(now_ns)
         self._receive(data, address, now_ns)
 
     def datagrams_to_send(self, now_ns: int) -> list[tuple[bytes, Address]]:
@@ -176,6 +181,15 @@ class ServerLink:
             self._outgoing.append((session.seal(Goodbye("the server stops")), session.address))
             self._end(session, "the server stops")
         self._pending.clear()
+
+    def _check_clock(self, now_ns: int) -> None:
+        """Begin anew when the rig clock was set back: the agents come again within a second."""
+        if now_ns < self._latest_ns - _BACKWARD_STEP_NS:
+            for session in list(self._sessions.values()):
+                self._outgoing.append((session.seal(Goodbye("the rig clock was set back")), session.address))
+                self._end(session, "the rig clock was set back")
+            self._due_ns = None
+        self._latest_ns = now_ns
 
     # ---- dispatch
 

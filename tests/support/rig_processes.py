@@ -27,6 +27,7 @@ from rig_server.config import CameraSettings, RigSettings
 LOOPBACK = "127.0.0.1"
 START_TIMEOUT_S = 60.0  # a dozen interpreters start at once on two busy cores
 _STOP_TIMEOUT_S = 10.0
+_STEPPING_CLOCK = Path(__file__).with_name("stepping_clock.py")
 
 
 def free_port() -> int:
@@ -56,11 +57,18 @@ class AgentProcess:
     """One `rig-agent`, restartable; everything it prints goes to its log."""
 
     def __init__(
-        self, log: Path, port: int, options: Sequence[object], env: Mapping[str, str] | None = None
+        self,
+        log: Path,
+        port: int,
+        options: Sequence[object],
+        env: Mapping[str, str] | None = None,
+        stepping: bool = False,
     ) -> None:
+        """`stepping`: SIGUSR1 and SIGUSR2 make its clock jump (support/stepping_clock.py)."""
         self._log, self._env = log, env
+        program = [str(_STEPPING_CLOCK), "rig_agent.cli"] if stepping else ["-m", "rig_agent.cli"]
         self._words = [
-            *(sys.executable, "-m", "rig_agent.cli", "--server", f"{LOOPBACK}:{port}"),
+            *(sys.executable, *program, "--server", f"{LOOPBACK}:{port}"),
             *("--key-file", str(rig_key_file())),
             *map(str, options),
         ]
@@ -79,6 +87,11 @@ class AgentProcess:
         assert self._process is not None
         self._process.kill()
         self._process.wait()
+
+    def send_signal(self, number: int) -> None:
+        """Any signal."""
+        assert self._process is not None
+        self._process.send_signal(number)
 
     def stop(self) -> int:
         """As systemd does; the exit status."""
@@ -128,7 +141,9 @@ def folder_agents(
             agent.kill()
 
 
-def write_small_rig(folder: Path, cameras: int = 12, frames: int = 2) -> list[RgbdFrame]:
+def write_small_rig(
+    folder: Path, cameras: int = 12, frames: int = 2, shape: tuple[int, int] = (120, 160)
+) -> list[RgbdFrame]:
     """A rig folder of small random images, every one different; the frames that it holds."""
     rng = np.random.default_rng(cameras)
     ring = RingDrawing()
@@ -138,8 +153,8 @@ def write_small_rig(folder: Path, cameras: int = 12, frames: int = 2) -> list[Rg
             camera_id=camera,
             sequence=index,
             timestamp_ns=0,
-            color=rng.integers(0, 256, (120, 160, 3), dtype=np.uint8),
-            raw=rng.integers(0, 2048, (120, 160), dtype=np.uint16),
+            color=rng.integers(0, 256, (*shape, 3), dtype=np.uint8),
+            raw=rng.integers(0, 2048, shape, dtype=np.uint16),
         )
         for camera in range(cameras)
         for index in range(frames)
