@@ -1,8 +1,8 @@
 """What loss costs: incomplete sets and added latency under loss, bursts, reordering and duplication.
 
-The rig of twelve runs in virtual time (support/virtual_rig.py): real links, pacers and synchroniser, faults on
-both directions of every path, an agent that gets to its mail 0.3 ms late on average. Nothing of this machine
-is in the figures, and the same seeds give them again.
+The rig of twelve runs in virtual time (support/virtual_rig.py): real links, pacers and synchroniser, faults
+on both directions of every path, an agent that gets to its mail 0.3 ms late on average. Nothing of this
+machine is in the figures, and the same seeds give them again.
 
 Run: python tests/benchmarks/transport_recovery.py
 """
@@ -86,7 +86,7 @@ def summarise(outcomes: list[Outcome], undisturbed_p99_ms: float) -> dict[str, A
 
 
 def run(advance: Callable[[], None] = lambda: None) -> list[dict[str, Any]]:
-    """The section `recovery` of bench.json; `advance` is called after each of `len(CASES) * len(SEEDS)` runs."""
+    """The section `recovery` of bench.json; `advance` is called after each of its runs."""
     jobs = [(case, seed) for case in CASES for seed in SEEDS]
     outcomes: dict[str, list[Outcome]] = {case.name: [] for case in CASES}
     with ProcessPoolExecutor(len(os.sched_getaffinity(0))) as pool:

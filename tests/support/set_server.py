@@ -2,7 +2,8 @@
 
 python tests/support/set_server.py SETTINGS.json
 
-SETTINGS.json holds rig settings. A line is {"t": monotonic seconds, "missing": [...]} or {"t": ..., "status": {...}}.
+SETTINGS.json holds rig settings. A line is {"t": monotonic seconds, "missing": [...]} or
+{"t": ..., "status": {...}}.
 SIGUSR1 and SIGUSR2 set this process's clock one hour ahead and back (support/stepping_clock.py).
 """
 

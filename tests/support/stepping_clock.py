@@ -1,7 +1,7 @@
 """A clock that can be made to jump, put in before a program reads the time; the machine's own is not touched.
 
-Import it first. SIGUSR1 sets this process's monotonic clock one hour ahead, SIGUSR2 one hour back. As a program:
-python tests/support/stepping_clock.py MODULE ARGUMENTS... runs MODULE so.
+Import it first. SIGUSR1 sets this process's monotonic clock one hour ahead, SIGUSR2 one hour back. As a
+program: python tests/support/stepping_clock.py MODULE ARGUMENTS... runs MODULE so.
 """
 
 import runpy

@@ -1,6 +1,7 @@
 """A whole rig in virtual time: real links, pacers and synchroniser, lossy paths, no socket and no real clock.
 
-What it shows is the protocol's own: no busy machine adds to a delay, and the same seed gives the same figures.
+What it shows is the protocol's own: no busy machine adds to a delay, and the same seed gives the same
+figures.
 """
 
 import heapq
