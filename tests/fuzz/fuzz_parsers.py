@@ -81,7 +81,7 @@ _connected = _Connected()
 
 
 def server_link(data: bytes) -> None:
-    """A connected server takes strangers' datagrams, also from the agent's address: no frame comes of them."""
+    """A connected server takes datagrams of strangers, some from its agent's address: no frame comes."""
     _, server, session_id = _connected.links()
     now_ns = T0
     for k, piece in enumerate(_pieces(data)):
