@@ -20,10 +20,14 @@ _MAX_RESENDS = 512
 
 @dataclass(frozen=True, slots=True)
 class BurstGrid:
-    """Moments at which bursts leave: agent times that are `phase_ns` modulo `step_ns`."""
+    """Moments at which bursts leave: agent times that are `phase_ns` modulo `step_ns`.
+
+    `spread`: share of the frame interval to send a frame over.
+    """
 
     step_ns: int
     phase_ns: int
+    spread: float
 
     def next_ns(self, now_ns: int) -> int:
         """The first moment from `now_ns` on."""
@@ -135,7 +139,7 @@ class Pacer:
     def _start(self, batch: DatagramBatch, now_ns: int) -> None:
         self._current, self._position = batch, 0
         if self.grid is not None and self._spread > 0:
-            steps = max(1, int(self.interval_ns * self._spread / self.grid.step_ns))
+            steps = max(1, int(self.interval_ns * self.grid.spread / self.grid.step_ns))
             self._step_ns, self._burst = self.grid.step_ns, -(-len(batch) // steps)
             self._started_ns = self._due_ns = self.grid.next_ns(now_ns)
             return

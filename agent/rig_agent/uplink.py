@@ -171,7 +171,7 @@ class Uplink:
         if plan is self._plan:
             return
         self._plan = plan
-        self._pacer.grid = None if plan is None else BurstGrid(plan.step_ns, plan.phase_ns)
+        self._pacer.grid = None if plan is None else BurstGrid(plan.step_ns, plan.phase_ns, plan.spread)
         planned_ns = 0 if plan is None else round(1e9 / plan.fps)
         self._pacer.interval_ns = max(self._full_interval_ns, planned_ns)
 

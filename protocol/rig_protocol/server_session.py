@@ -137,13 +137,13 @@ class ServerSession:
         choice, clock = self.choice, self._clock.estimate
         if choice is None or clock is None:
             return None
-        slot_ns = choice.step_ns * choice.slot // choice.slots
         return StreamPlan(
             color_codec=choice.color_codec,
             depth_codec=choice.depth_codec,
             fps=choice.fps,
             step_ns=choice.step_ns,
-            phase_ns=(slot_ns - clock.offset_ns) % choice.step_ns,
+            phase_ns=(choice.phase_ns - clock.offset_ns) % choice.step_ns,
+            spread=choice.spread,
         )
 
     def _accept(self, frame: EncodedFrame, now_ns: int) -> EncodedFrame | None:
