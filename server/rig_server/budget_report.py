@@ -23,8 +23,8 @@ _COLOR = ("bayer-lossless", "bayer-uncompressed", "bgr-jpeg")
 _DEPTH = ("disparity-lossless", "disparity-uncompressed")
 _WAYS = {
     "raw Bayer + 16-bit": ("bayer-uncompressed", "disparity-uncompressed"),
-    "lossless Bayer + disparity": ("bayer-lossless", "disparity-lossless"),
-    "JPEG + lossless disparity": ("bgr-jpeg", "disparity-lossless"),
+    "lossless Bayer + depth": ("bayer-lossless", "disparity-lossless"),
+    "JPEG + lossless depth": ("bgr-jpeg", "disparity-lossless"),
 }
 
 
@@ -89,14 +89,14 @@ def render(report: BudgetReport) -> RenderableType:
     """The report for a terminal; fits 80 columns."""
     table = Table(box=box.SIMPLE_HEAD, pad_edge=False, padding=(0, 1, 0, 0))
     table.add_column("a frame holds", no_wrap=True)
-    headings = ("bytes", "MB/s", "of port", "max fps", "in noise", "")
+    headings = ("bytes", "MB/s", "share", "≤ fps", "noise", "")
     for heading in headings:
-        table.add_column(heading, justify="right", no_wrap=heading in ("bytes", ""))
+        table.add_column(heading, justify="right", no_wrap=True)
     for row in report.rows:
         table.add_row(*_cells(row, report), style="bold" if row.chosen else "")
     title = (
-        f"{report.cameras} cameras at {report.fps:g} fps; the port of {report.link.speed_mbit:g} Mbit/s carries "
-        f"{_port(report.link).udp_bytes_s / 1e6:.1f} MB/s"
+        f"{report.cameras} cameras at {report.fps:g} fps, a port of {report.link.speed_mbit:g} Mbit/s "
+        f"that carries {_port(report.link).udp_bytes_s / 1e6:.1f} MB/s"
     )
     return Group(Text(title), table, Text(f"{report.reason}."), *map(Text, _pacing_lines(report)))
 
@@ -105,7 +105,7 @@ def _rows(
     link: LinkSettings, cameras: int, fps: float, chosen: tuple[int | None, int | None] | None
 ) -> Iterator[Row]:
     size = paper_bytes()
-    yield _row("RGB24 + 16-bit (the paper)", size, size, size, link, cameras, fps, chosen=False)
+    yield _row("RGB24 + 16-bit (paper)", size, size, size, link, cameras, fps, chosen=False)
     for name, (color_name, depth_name) in _WAYS.items():
         ids = (codec_by_name(color_name).id, codec_by_name(depth_name).id)
         expected = sum(expected_bytes(one, _PIXELS) for one in ids)
@@ -158,6 +158,7 @@ def _cells(row: Row, report: BudgetReport) -> tuple[str, ...]:
 
 def _pacing_lines(report: BudgetReport) -> Iterator[str]:
     pacing, link = report.pacing, report.link
+    yield "≤ fps: at which the port is full; noise: the same for a scene of nothing but noise."
     yield (
         f"Sizes are those of our real test frames; until yours have come, {link.size_margin:.2f} times as "
         f"much is expected. {link.usable:.0%} of a port may be used."

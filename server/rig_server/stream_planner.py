@@ -19,14 +19,10 @@ from rig_server.config import LinkSettings
 from rig_server.link_budget import Pacing
 from rig_server.link_demand import Demand, LinkDemand
 from rig_server.loss_watch import LossWatch
+from rig_server.step_patience import StepPatience
 from rig_server.stream_ladder import TOP, Level, ladder
 
-_SECOND_NS = 1_000_000_000
-_PATIENCE_NS = _SECOND_NS // 2  # of overload; sizes are means over a quarter of a second
 _ROOM = 0.9  # a better level must leave a tenth of what may be used, or the next cloud ends it
-# A step up that lasted less has failed; the next one waits twice as long as the last.
-_FIRST_HOLD_OFF_NS = 60 * _SECOND_NS
-_LONGEST_HOLD_OFF_NS = 3600 * _SECOND_NS
 # A gigabit port that came up as a 100-Mbit one carries a tenth. Losses below that are no overload.
 _LEAST_OVERLOAD = 0.1
 _SAME_STEP = (0.9, 1.2)  # times the present step: within, agents keep theirs
@@ -84,11 +80,7 @@ class StreamPlanner:
         self._loss = LossWatch()
         self._notes: deque[Note] = deque(maxlen=_MAX_NOTES)
         self._now_ns = 0
-        self._overload_since_ns: int | None = None
-        self._room_since_ns: int | None = None
-        self._stepped_up_ns: int | None = None
-        self._hold_off_ns = 0
-        self._hold_until_ns = 0
+        self._patience = StepPatience(settings.step_up_s)
         self._told_of_overload = False
 
     @property
@@ -155,11 +147,10 @@ class StreamPlanner:
         losses = {i: count for i, count in (lost or {}).items() if i in remote}
         self._loss.update(self._demand.received, losses, now_ns)
         demand = self._demand.at(self._level, now_ns)
-        if not self._demand.fits(demand):
-            self._room_since_ns = None
-            self._bear_overload(demand)
-        else:
-            self._overload_since_ns = None
+        too_much = not self._demand.fits(demand)
+        if self._patience.too_long_over(too_much, now_ns):
+            self._answer_overload(demand)
+        if not too_much:
             self._told_of_overload = False
             if self._loss.overloaded:
                 self._answer_loss(demand)
@@ -168,17 +159,13 @@ class StreamPlanner:
         self._keep_pace()
         return self.choices
 
-    # ---- down
+    # ---- down and up
 
-    def _bear_overload(self, demand: Demand) -> None:
-        """Half a second may pass; then down to what fits, or a word when there is nothing below."""
-        if self._overload_since_ns is None:
-            self._overload_since_ns = self._now_ns
-        if self._now_ns - self._overload_since_ns < _PATIENCE_NS:
-            return
+    def _answer_overload(self, demand: Demand) -> None:
+        """Down to what fits, or a word when there is nothing below."""
         level = self._best_from(self._level)
         if level != self._level:
-            self._note_failed_step()
+            self._patience.overload_ended_step(self._now_ns)
             self._step_down(level)
             self._share_out()
         elif not self._told_of_overload:
@@ -187,12 +174,11 @@ class StreamPlanner:
 
     def _answer_loss(self, demand: Demand) -> None:
         """The sizes say that it fits, the losses that it does not: one level down."""
-        self._room_since_ns = None
         level = self._below(self._level)
         if level is None or demand.wire_bytes_s < _LEAST_OVERLOAD * self._demand.port.wire_bytes_s:
             return
         reason = plan_words.losses(self._loss.share, demand, self._demand.port)
-        self._note_failed_step()
+        self._patience.overload_ended_step(self._now_ns)
         self._step_down(level, reason)
         self._share_out()
 
@@ -201,37 +187,17 @@ class StreamPlanner:
         reason = reason or plan_words.too_much(before, self._demand)
         self._note(logging.WARNING, plan_words.step_down(reason, after))
         self._level = level
-        self._overload_since_ns = self._room_since_ns = None
         self._loss.answered()
-
-    def _note_failed_step(self) -> None:
-        """Hold off for longer when the last step up did not last, for less when it did."""
-        since_ns = self._stepped_up_ns
-        self._stepped_up_ns = None
-        if since_ns is None:
-            return
-        if self._now_ns - since_ns < max(_FIRST_HOLD_OFF_NS, self._hold_off_ns):
-            self._hold_off_ns = min(max(2 * self._hold_off_ns, _FIRST_HOLD_OFF_NS), _LONGEST_HOLD_OFF_NS)
-        else:
-            self._hold_off_ns //= 2
-        self._hold_until_ns = self._now_ns + self._hold_off_ns
-
-    # ---- up
 
     def _look_up(self) -> None:
         """The next better level, when it has fitted with room to spare for long enough."""
         level = self._above(self._level)
-        if level is None or not self._demand.fits(self._demand.at(level, self._now_ns), _ROOM):
-            self._room_since_ns = None
-            return
-        if self._room_since_ns is None:
-            self._room_since_ns = self._now_ns
-        waited_ns = self._now_ns - self._room_since_ns
-        if waited_ns < self._settings.step_up_s * _SECOND_NS or self._now_ns < self._hold_until_ns:
-            return
-        self._level, self._room_since_ns, self._stepped_up_ns = level, None, self._now_ns
-        self._share_out()
-        self._note(logging.INFO, plan_words.room_again(self._latest, self._demand.port))
+        room = level is not None and self._demand.fits(self._demand.at(level, self._now_ns), _ROOM)
+        if self._patience.long_enough_under(room, self._now_ns) and level is not None:
+            self._patience.stepped_up(self._now_ns)
+            self._level = level
+            self._share_out()
+            self._note(logging.INFO, plan_words.room_again(self._latest, self._demand.port))
 
     # ---- levels
 
@@ -254,8 +220,7 @@ class StreamPlanner:
         return next(others, None)
 
     def _start(self, level: Level) -> None:
-        self._hold_off_ns = self._hold_until_ns = 0
-        self._stepped_up_ns = self._room_since_ns = self._overload_since_ns = None
+        self._patience.begin()
         self._level = TOP
         if self._demand.at(level, self._now_ns).streams != self._demand.at(TOP, self._now_ns).streams:
             self._step_down(level)
