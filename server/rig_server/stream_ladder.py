@@ -5,9 +5,9 @@ cameras stand on one level (docs/decisions/0009-one-level-for-all-cameras.md). D
 """
 
 import math
-from collections.abc import Iterable
 from dataclasses import dataclass
 from enum import IntEnum
+from functools import lru_cache
 
 from rig_protocol.codecs import COLOR_CODECS, DEPTH_CODECS, codec
 from rig_protocol.message_bytes import MIN_FPS
@@ -63,15 +63,16 @@ def streams_at(hello: Hello, level: Level, top_fps: float) -> Streams:
     """
     divisor = math.ceil(hello.fps * level.divisor / top_fps - 1e-6)
     return Streams(
-        _pick((one for one in hello.color_codecs if one in COLOR_CODECS), level.manner),
-        _pick((one for one in hello.depth_codecs if one in DEPTH_CODECS), level.manner),
+        _pick(hello.color_codecs, COLOR_CODECS, level.manner),
+        _pick(hello.depth_codecs, DEPTH_CODECS, level.manner),
         max(hello.fps / max(1, divisor), MIN_FPS),
     )
 
 
-def _pick(offered: Iterable[int], manner: Manner) -> int | None:
+@lru_cache(maxsize=256)  # asked a thousand times a second; agents differ little
+def _pick(offered: tuple[int, ...], accepted: tuple[int, ...], manner: Manner) -> int | None:
     """The smallest of the preferred codec and those that the manner allows."""
-    known = list(offered)
+    known = [one for one in offered if one in accepted]
     allowed = known[:1] + [one for one in known[1:] if _allows(manner, one)]
     return min(allowed, key=lambda one: expected_bytes(one, 1), default=None)
 

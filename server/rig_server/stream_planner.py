@@ -215,8 +215,8 @@ class StreamPlanner:
 
     def _next_other(self, candidates: list[Level]) -> Level | None:
         """The first on which the cameras send anything else than now."""
-        streams = self._demand.at(self._level, self._now_ns).streams
-        others = (one for one in candidates if self._demand.at(one, self._now_ns).streams != streams)
+        present = self._latest.streams
+        others = (one for one in candidates if self._demand.at(one, self._now_ns).streams != present)
         return next(others, None)
 
     def _start(self, level: Level) -> None:

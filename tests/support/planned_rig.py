@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
+from functools import cache
 
 from rig_protocol.codecs import codec_by_name
 from rig_protocol.events import Address
@@ -23,13 +24,18 @@ DEPTH = codec_by_name("disparity-lossless").id
 KINECT = make_hello(color_codecs=(LOSSLESS, UNCOMPRESSED, JPEG), depth_codecs=(DEPTH,), fps=30.0)
 
 
+@cache
+def _payload(codec_id: int, size: int) -> Payload:
+    return Payload(codec_id, bytes(size))
+
+
 @dataclass
 class PlannedRig:
     """`sizes`: true bytes of an image by codec. `history`: (time, choice of the first camera, true load)."""
 
     planner: StreamPlanner
     sizes: dict[int, int]
-    port: Port = Port(1000)
+    port: Port = field(default_factory=lambda: Port(1000))
     carries: float = 1.0  # what the port really carries, as a share of what the planner thinks
     extra_loss: float = 0.0
     now_ns: int = 100 * SECOND_NS
@@ -92,16 +98,18 @@ class PlannedRig:
             self._owed[camera_id] -= frames
             came = round(frames * arriving)
             self._lost[camera_id] = self._lost.get(camera_id, 0) + frames - came
+            frame = self.frame(camera_id, choice)
             for _ in range(came):
-                self.planner.frame_received(self._frame(camera_id, choice))
+                self.planner.frame_received(frame)
         self.planner.update(self.now_ns, self._lost)
         self.notes += self.planner.take_notes()
         if self.planner.choices:
             self.history.append((self.now_ns, self.now, self.load))
 
-    def _frame(self, camera_id: int, choice: StreamChoice) -> EncodedFrame:
+    def frame(self, camera_id: int, choice: StreamChoice) -> EncodedFrame:
+        """A frame as the choice wants it."""
         payloads = [
-            None if one is None else Payload(one, bytes(self._image(one)))
+            None if one is None else _payload(one, self._image(one))
             for one in (choice.color_codec, choice.depth_codec)
         ]
         return EncodedFrame(camera_id, 0, 0, color=payloads[0], depth=payloads[1])

@@ -1,8 +1,8 @@
 """The controller in virtual time: what it chooses, when it steps, and what it says."""
 
 import logging
-from collections import Counter
 from dataclasses import replace
+from itertools import pairwise
 from typing import Any
 
 import pytest
@@ -26,7 +26,7 @@ KIB = 1024
 OFFICE = {LOSSLESS: 159 * KIB, UNCOMPRESSED: 300 * KIB, JPEG: 60 * KIB, DEPTH: 32 * KIB}
 FOREST = {LOSSLESS: 270 * KIB, UNCOMPRESSED: 300 * KIB, JPEG: 110 * KIB, DEPTH: 80 * KIB}
 HERE: Address = ("127.0.0.1", 40001)
-examples = settings(deadline=None, derandomize=True, max_examples=60)
+examples = settings(deadline=None, derandomize=True, max_examples=20)
 
 
 def rig(cameras: int = 12, scene: dict[int, int] = OFFICE, carries: float = 1.0, **link: Any) -> PlannedRig:
@@ -98,10 +98,10 @@ def test_the_operator_can_keep_jpeg_out() -> None:
 
 
 def test_an_agents_own_port_counts_too() -> None:
-    made = PlannedRig(StreamPlanner(LinkSettings(agent_speed_mbit=100), 2), OFFICE)
+    made = PlannedRig(StreamPlanner(LinkSettings(agent_speed_mbit=80), 2), OFFICE)
     made.join(2, replace(KINECT, color_codecs=(UNCOMPRESSED, LOSSLESS)))
     assert made.now.color_codec == LOSSLESS
-    assert "own port of 100 Mbit/s" in made.planner.take_notes()[0].text
+    assert "own port of 80 Mbit/s" in made.planner.take_notes()[0].text
 
 
 @pytest.mark.parametrize("host", ["127.0.0.1", "127.3.2.1", "::1"])
@@ -181,14 +181,15 @@ def test_all_comes_back_when_the_scene_is_easy_again() -> None:
 
 
 def test_a_scene_that_stays_dear_is_tried_ever_less_often() -> None:
-    made = rig(scene=FOREST)
-    made.run(2 * 3600)
+    made = rig(2, FOREST | {LOSSLESS: 300 * KIB, DEPTH: 40 * KIB}, speed_mbit=1000 / 6)
+    made.port = replace(made.port, speed_mbit=1000 / 6)
+    made.run(1200)
     up = [time_s for time_s, color, _ in made.changes()[1:] if color == LOSSLESS]
-    waits = [after - before for before, after in zip(up, up[1:], strict=False)]
-    assert 3 <= len(up) <= 8
+    waits = [after - before for before, after in pairwise(up)]
+    assert 3 <= len(up) <= 5
     assert waits == sorted(waits)
     share = sum(choice.color_codec == LOSSLESS for _, choice, _ in made.history) / len(made.history)
-    assert share < 0.002, "a try costs a second"
+    assert share < 0.01, "a try costs a second"
 
 
 def test_a_link_slower_than_its_setting_shows_by_losses() -> None:
@@ -260,7 +261,7 @@ def test_every_camera_has_a_slot_of_its_own_in_one_common_step() -> None:
     assert len({(one.step_ns, one.spread) for one in choices}) == 1
     phases = sorted(one.phase_ns for one in choices)
     assert all(0 <= phase < choices[0].step_ns for phase in phases)
-    assert min(after - before for before, after in zip(phases, phases[1:], strict=False)) > 80_000
+    assert min(after - before for before, after in pairwise(phases)) > 80_000
 
 
 def test_steps_do_not_change_with_every_frame() -> None:
@@ -278,7 +279,7 @@ def test_notes_are_bounded_and_frames_of_strangers_have_no_effect() -> None:
     assert len(made.planner.take_notes()) <= 32
     made.join(1)
     made.leave(0)
-    made.planner.frame_received(made._frame(7, StreamChoice(LOSSLESS, DEPTH, 30.0, 0, 1, 1, 0.8)))
+    made.planner.frame_received(made.frame(7, StreamChoice(LOSSLESS, DEPTH, 30.0, 0, 1, 1, 0.8)))
     assert made.planner.update(made.now_ns) == {}
 
 
@@ -326,34 +327,35 @@ def test_no_two_steps_up_are_closer_than_the_setting_whatever_happens(
     scenes: list[tuple[dict[int, int], float]], cameras: int, carries: float
 ) -> None:
     made = rig(cameras, carries=carries)
-    for kib, seconds in scenes * 3:
+    for kib, seconds in scenes * 2:
         scene = {codec_id: size * KIB for codec_id, size in kib.items()}
         made.run(seconds, lambda _, scene=scene: scene)  # type: ignore[misc]
     changes = made.changes()
-    pairs = zip(changes, changes[1:], strict=False)
+    pairs = pairwise(changes)
     rank = {LOSSLESS: 0, JPEG: 1}
     up = [
         after[0]
         for before, after in pairs
         if (rank[after[1] or 0], -after[2]) < (rank[before[1] or 0], -before[2])
     ]
-    assert all(after - before >= 10 for before, after in zip(up, up[1:], strict=False))
+    assert all(after - before >= 10 for before, after in pairwise(up))
     elapsed_s = (made.history[-1][0] - made.history[0][0]) / 1e9
     assert len(up) <= elapsed_s / 10
 
 
 @examples
-@given(SCENES, st.integers(1, 16), st.sampled_from([100, 300, 1000]))
-def test_a_scene_that_stays_settles_on_the_best_level_that_fits_with_room(
+@given(SCENES, st.integers(1, 6), st.sampled_from([20, 50, 200]))
+def test_a_rig_settles_where_the_next_better_rate_would_leave_no_room(
     kib: dict[int, int], cameras: int, speed_mbit: int
 ) -> None:
-    """After a dear time everything comes back, as far as it fits; what only just fits may stay away."""
     made = rig(cameras, speed_mbit=speed_mbit)
     made.port = replace(made.port, speed_mbit=speed_mbit)
     made.run(3, lambda _: FOREST)
-    cheap = {codec_id: size * KIB // 8 for codec_id, size in kib.items()} | {UNCOMPRESSED: 300 * KIB}
-    made.run(600, lambda _: cheap)
-    states = Counter((choice.color_codec, choice.fps) for _, choice, _ in made.history[-200:])
-    assert len(states) <= 3
-    made_fps = made.now.fps
-    assert made_fps == 30.0 or made.load > 0.2
+    calm = {codec_id: size * KIB // 8 for codec_id, size in kib.items()} | {UNCOMPRESSED: 300 * KIB}
+    made.run(120, lambda _: calm)
+    settled = made.now
+    made.run(20)
+    assert made.now == settled
+    if settled.fps < 30.0:
+        better = min(30.0 / k for k in (1, 2, 3, 4, 5, 6, 8, 10, 15) if 30.0 / k > settled.fps)
+        assert made.load * better / settled.fps > 0.95 * 0.9 - 1e-3
