@@ -9,11 +9,12 @@ from rig_protocol.codecs import Codec, ImageKind, codec, codecs_for
 from rig_protocol.codecs.raw import UncompressedCodec
 from rig_protocol.messages import Hello
 
-# The manners that an agent offers, best first. Nothing is sent lossy that the operator wanted lossless.
+# The manners that an agent offers, best first. JPEG comes last unless it is wanted: a server asks for it
+# only when the link carries nothing better, and never when its [link] jpeg = false.
 _OFFERS: dict[Manner, tuple[Manner, ...]] = {
-    "lossless": ("lossless", "raw"),
+    "lossless": ("lossless", "raw", "jpeg"),
     "jpeg": ("jpeg", "lossless", "raw"),
-    "raw": ("raw", "lossless"),
+    "raw": ("raw", "lossless", "jpeg"),
 }
 
 

@@ -1,5 +1,6 @@
 """The command line of `rig-server`."""
 
+import json
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -7,11 +8,13 @@ import typer
 from rich.console import Console
 
 from rig_protocol.errors import ConfigurationError
-from rig_protocol.programs import run_program, set_up_logging
+from rig_protocol.programs import EXIT_FAILED, run_program, set_up_logging
 
 if TYPE_CHECKING:
     from rig_server.config import RigSettings
     from rig_server.rig import Rig
+
+_RING = 12  # cameras where no settings say how many
 
 _EXAMPLES = """
 **Examples**
@@ -23,6 +26,8 @@ _EXAMPLES = """
 `rig-server --calibrate --out calibration` — calibrate the ring that streams to this PC
 
 `rig-server --calibrate --simulate 12 --out demo` — the same with twelve simulated Kinects on this machine
+
+`rig-server budget` — what the network must carry, what fits, and what the server would choose
 
 Every option can also stand in rig.toml or in the environment (RIG_SERVER_LISTEN, ...).
 The command line wins over the environment, the environment over the file.
@@ -140,6 +145,58 @@ def keygen(
         f"for example: scp {path} pi@cam00.local:",
         soft_wrap=True,
     )
+
+
+_BUDGET_EXAMPLES = """
+**Examples**
+
+`rig-server budget` — the rig of rig.toml, or twelve cameras, at 30 frames/s
+
+`rig-server budget --cameras 12 --link-mbit 100` — what a 100-Mbit port would do to it
+
+`rig-server budget --fps 15 --json` — for a script
+
+A frame's size follows from the scene: the table goes by real frames, and says how many frames a second
+scenes of pure noise would allow. docs/network.md explains it, `[link]` of rig.toml sets it.
+Exit status: 0 something fits, 1 nothing does, 2 wrong usage or settings.
+"""
+
+
+@app.command(epilog=_BUDGET_EXAMPLES)
+def budget(
+    config: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FILE", help="Settings; else ./rig.toml, else /etc/kinect-rig/rig.toml, if there."
+        ),
+    ] = None,
+    cameras: Annotated[
+        int | None, typer.Option(metavar="N", min=1, max=64, help="Cameras; else those of rig.toml, else 12.")
+    ] = None,
+    fps: Annotated[
+        float, typer.Option(metavar="F", min=0.1, max=240, help="Frames a second of each camera.")
+    ] = 30.0,
+    link_mbit: Annotated[
+        float | None, typer.Option(metavar="M", help="Speed of this PC's port in Mbit/s; else 1000.")
+    ] = None,
+    mtu: Annotated[
+        int | None, typer.Option(metavar="BYTES", help="Largest IP packet of the network; else 1500.")
+    ] = None,
+    as_json: Annotated[bool, typer.Option("--json", help="Print JSON and nothing else.")] = False,
+) -> None:
+    """Print what the network must carry, what fits, and what the server would choose and why."""
+    from rig_server.budget_report import make_report, render
+    from rig_server.config import load_rig_settings
+
+    settings = load_rig_settings(config, {"link": {"speed_mbit": link_mbit, "mtu": mtu}})
+    known = len(settings.cameras) or settings.expected_cameras or _RING
+    report = make_report(settings.link, cameras or known, fps)
+    if as_json:
+        typer.echo(json.dumps(report.to_dict(), indent=2))
+    else:
+        Console(highlight=False).print(render(report))
+    if report.chosen_fps is None:
+        raise typer.Exit(EXIT_FAILED)
 
 
 def _open_rig(settings: "RigSettings", simulate: int | None, seed: int | None) -> "Rig":

@@ -8,6 +8,7 @@ from pydantic import Field, field_validator, model_validator
 
 from rig_calib.settings import CalibrationSettings
 from rig_protocol.camera import CameraModel
+from rig_protocol.datagram import MIN_DATAGRAM_SIZE
 from rig_protocol.errors import ConfigurationError, DataError
 from rig_protocol.events import Address
 from rig_protocol.rig_folder import RingDrawing, read_json
@@ -66,6 +67,32 @@ class SynchroniserSettings(Settings):
     """How long after one frame period a set waits for a frame that is late before it goes out partial."""
 
 
+class LinkSettings(Settings):
+    """The network between agents and server: what it carries, and what to do when that is too little.
+
+    Agents on this machine load no port and are left out of the sum. `rig-server budget` prints it.
+    """
+
+    speed_mbit: float = Field(1000.0, gt=0, le=400_000)
+    """Speed of the port that this PC hangs on, in Mbit/s."""
+    agent_speed_mbit: float = Field(1000.0, gt=0, le=400_000)
+    """Speed of each agent's own port, in Mbit/s; that of a Raspberry Pi 3 is 100."""
+    mtu: int = Field(1500, ge=MIN_DATAGRAM_SIZE + 28, le=65_535)
+    """Largest IP packet of the network in bytes; beyond 1500 every port and switch must be set up for it."""
+    usable: float = Field(0.95, gt=0, le=1)
+    """Share of a port to plan with; the rest is for resends, clock exchanges and scenes that change."""
+    switch_buffer_kib: int = Field(128, ge=1, le=1 << 20)
+    """What the switch buffers for one port; small ones have 128 to 256 KiB for all."""
+    adapt: bool = True
+    """Step down when the link is too small, and up again; false: refuse what does not fit."""
+    jpeg: bool = True
+    """Whether stepping down may send colour as JPEG; false: go to fewer frames at once."""
+    size_margin: float = Field(1.25, ge=1, le=10)
+    """How much larger than our real test frames to expect images before the first have come."""
+    step_up_s: float = Field(10.0, ge=1, le=3600)
+    """How long more must have fitted the link before it is sent."""
+
+
 class CaptureSettings(Settings):
     """What `--calibrate` waits for and collects."""
 
@@ -93,6 +120,7 @@ class RigSettings(Settings):
     log_level: Literal["DEBUG", "INFO", "WARNING", "ERROR"] = "INFO"
     """What is worth a line in the log."""
     synchroniser: SynchroniserSettings = SynchroniserSettings()
+    link: LinkSettings = LinkSettings()
     capture: CaptureSettings = CaptureSettings()
     calibration: CalibrationSettings = CalibrationSettings()
     ring: RingSettings | None = None

@@ -89,6 +89,8 @@ def test_rig_toml_of_the_working_directory_is_found(written: Path, monkeypatch: 
         ("[[cameras]]\nname = 'cam01'", "cameras.0.id"),
         ("expected_cameras = 3\n[[cameras]]\nid = 0", "expected_cameras is 3, 1 are listed"),
         ("[capture]\nframes = 0", "capture.frames"),
+        ("[link]\nusable = 1.5", "link.usable"),
+        ("[link]\nspeed = 100", "did you mean `speed_mbit`"),
         ("[synchroniser]\ndeadline_ms = -5", "synchroniser.deadline_ms"),
         ("listen = ", "is not valid TOML"),
     ],
