@@ -131,7 +131,8 @@ class Agent:
         # Control first: cutting a frame takes a millisecond, which the clock exchange would feel.
         self._uplink.serve(time_ns)
         self._wanted = self._uplink.wanted
-        self._capture.wanted_fps = None if self._wanted is None else self._wanted.fps
+        if self._wanted is not None:
+            self._capture.want(self._wanted.fps, self._wanted.rig_offset_ns)
         while (frame := self._encoded.get()) is not None:
             self._uplink.send_frame(frame, time_ns)
 

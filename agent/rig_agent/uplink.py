@@ -27,12 +27,16 @@ _BURST_HASTE = 4.0
 
 @dataclass(frozen=True, slots=True)
 class Wanted:
-    """What the server wants of this camera: codecs (None: not this stream), at most `fps` frames a second."""
+    """What the server wants of this camera: codecs (None: not this stream), at most `fps` frames a second.
+
+    Rig time is agent time and `rig_offset_ns`.
+    """
 
     camera_id: int
     color_codec: int | None
     depth_codec: int | None
-    fps: float | None
+    fps: float | None = None
+    rig_offset_ns: int = 0
 
 
 class Uplink:
@@ -74,8 +78,8 @@ class Uplink:
         plan = self._link.plan
         if plan is None:
             color, depth = _first(welcome.color_codecs), _first(welcome.depth_codecs)
-            return Wanted(welcome.camera_id, color, depth, None)
-        return Wanted(welcome.camera_id, plan.color_codec, plan.depth_codec, plan.fps)
+            return Wanted(welcome.camera_id, color, depth)
+        return Wanted(welcome.camera_id, plan.color_codec, plan.depth_codec, plan.fps, plan.offset_ns)
 
     @property
     def sent(self) -> int:
@@ -171,7 +175,7 @@ class Uplink:
         if plan is self._plan:
             return
         self._plan = plan
-        self._pacer.grid = None if plan is None else BurstGrid(plan.step_ns, plan.phase_ns, plan.spread)
+        self._pacer.grid = None if plan is None else _grid(plan)
         planned_ns = 0 if plan is None else round(1e9 / plan.fps)
         self._pacer.interval_ns = max(self._full_interval_ns, planned_ns)
 
@@ -206,6 +210,10 @@ class Uplink:
             case Disconnected(text):
                 self._pacer.clear()
                 _log.warning("lost %s: %s; trying on", self._server, text)
+
+
+def _grid(plan: StreamPlan) -> BurstGrid:
+    return BurstGrid(plan.step_ns, (plan.phase_ns - plan.offset_ns) % plan.step_ns, plan.spread)
 
 
 def _first(codecs: tuple[int, ...]) -> int | None:

@@ -303,6 +303,7 @@ def _plan_of(values: Fields) -> StreamPlan:
         step_ns=step_ns,
         phase_ns=integer(values, "phase_ns", 0, step_ns - 1),
         spread=number(values, "spread", MIN_SPREAD, 1.0),
+        offset_ns=integer(values, "offset_ns", -(2**63), 2**63 - 1),
     )
 
 

@@ -100,9 +100,10 @@ class StreamChoice:
 class StreamPlan:
     """What an agent is to send from now on, and when: the server's share of the link for one camera.
 
-    At most `fps` frames a second, each sent over the share `spread` of its interval. Bursts of datagrams
-    leave at agent times that are `phase_ns` modulo `step_ns`, so that those of different agents meet the
-    switch one after another.
+    At most `fps` frames a second, one in each of the rig clock's intervals, and each sent over the share
+    `spread` of its interval. Bursts of datagrams leave at rig times that are `phase_ns` modulo `step_ns`,
+    so that those of different agents meet the switch one after another. Rig time is agent time and
+    `offset_ns`.
     """
 
     color_codec: int | None
@@ -111,6 +112,7 @@ class StreamPlan:
     step_ns: int
     phase_ns: int
     spread: float
+    offset_ns: int
 
 
 @dataclass(frozen=True, slots=True)

@@ -133,7 +133,7 @@ class ServerSession:
         self.status.connected = False
 
     def _plan(self) -> StreamPlan | None:
-        """The choice in the agent's own clock; None without a choice or before its clock is known."""
+        """The choice, and the rig clock; None without a choice or before the agent's clock is known."""
         choice, clock = self.choice, self._clock.estimate
         if choice is None or clock is None:
             return None
@@ -142,8 +142,9 @@ class ServerSession:
             depth_codec=choice.depth_codec,
             fps=choice.fps,
             step_ns=choice.step_ns,
-            phase_ns=(choice.phase_ns - clock.offset_ns) % choice.step_ns,
+            phase_ns=choice.phase_ns,
             spread=choice.spread,
+            offset_ns=clock.offset_ns,
         )
 
     def _accept(self, frame: EncodedFrame, now_ns: int) -> EncodedFrame | None:

@@ -28,8 +28,11 @@ from rig_server.attendance import absence_message, is_whole
 from rig_server.config import RigSettings
 from rig_server.decoder import FrameDecoder
 from rig_server.description import camera_names, describe_rig
+from rig_server.link_budget import Port
 from rig_server.metrics import TEMPERATURE, CameraMetrics, RateMeter, RigStatus, summarise_sets
 from rig_server.receiver import Receiver, rig_time_ns
+from rig_server.stream_control import StreamControl
+from rig_server.stream_planner import StreamPlanner
 from rig_server.synchroniser import Synchroniser
 
 logger = logging.getLogger(__name__)
@@ -55,8 +58,17 @@ class LivePipeline:
             secrets.token_bytes,
             color_codecs=COLOR_CODECS,
             depth_codecs=DEPTH_CODECS,
+            datagram_size=Port(settings.link.speed_mbit, settings.link.mtu).datagram_size,
         )
-        self._receiver = Receiver(self._link, settings.address, self._on_event, settings.receive_buffer_bytes)
+        expected = len(settings.cameras) or settings.expected_cameras
+        self._streams = StreamControl(self._link, StreamPlanner(settings.link, expected))
+        self._receiver = Receiver(
+            self._link,
+            settings.address,
+            self._on_event,
+            settings.receive_buffer_bytes,
+            on_turn=self._streams.turn,
+        )
         # After the port is ours: its first construction on a machine compiles for seconds.
         self._decoder = FrameDecoder(self._assembler.add, threads=settings.decoder_threads)
         self._rates = RateMeter()
@@ -136,6 +148,7 @@ class LivePipeline:
 
     def _on_event(self, event: ServerEvent) -> None:
         """On the receiver's thread: nothing here may wait."""
+        self._streams.take(event, rig_time_ns())
         match event:
             case FrameReceived(frame):
                 self._decoder.submit(frame)
