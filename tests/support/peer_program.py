@@ -24,7 +24,7 @@ _IDLE_S = 1.0
 _PATIENCE_S = 30.0
 _QUEUE_FRAMES = 4  # of one camera at its sender: what an agent holds between encoder and network
 _LCM_QUEUE = 100  # messages between LCM's receiving thread and the program; its default is 30
-_LCM = "udpm://239.255.76.67:7667?ttl=0&recv_buf_size=8388608"
+_LCM = "udpm://239.255.76.67:7667?ttl=1&recv_buf_size=8388608"
 
 
 class FrameCount:

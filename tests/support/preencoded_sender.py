@@ -189,6 +189,8 @@ def sender_process(play: Play, frames: Path, prefix: Sequence[str] = ()) -> Iter
             yield SenderProcess(process)
         finally:
             process.terminate()
+            if process.stdout is not None and not process.stdout.closed:
+                process.stdout.read()  # nobody asked for the result: let it be printed all the same
 
 
 @contextmanager
