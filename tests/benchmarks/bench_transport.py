@@ -4,10 +4,8 @@ make bench-transport, or: python tests/benchmarks/bench_transport.py --only rig
 """
 
 import argparse
-import contextlib
 import importlib.util
 import json
-import os
 import sys
 from pathlib import Path
 from typing import Any
@@ -28,7 +26,6 @@ SECTIONS = {
     "chaos": "transport_chaos",
     "clock": "bench_clock",
 }
-_NICENESS = -15  # root's benchmarks do not wait for what else a shared machine does
 
 
 def available(section: str) -> bool:
@@ -53,8 +50,6 @@ def main() -> None:
     parser.add_argument("--page", action="store_true", help="measure nothing, write the page anew")
     known = parser.parse_args()
     chosen = [] if known.page else [one for one in known.only or SECTIONS if available(one)]
-    with contextlib.suppress(PermissionError):
-        os.setpriority(os.PRIO_PROCESS, 0, _NICENESS)
     with Progress(SpinnerColumn(), *Progress.get_default_columns(), TimeElapsedColumn()) as progress:
         task = progress.add_task("transport", total=len(chosen))
         for section in chosen:

@@ -11,6 +11,7 @@ from pathlib import Path
 from statistics import median
 
 _TICKS_A_SECOND = os.sysconf("SC_CLK_TCK")
+_CALM_S = 2.0
 _PAGE_BYTES = os.sysconf("SC_PAGE_SIZE")
 
 
@@ -86,6 +87,16 @@ def growth_mb(samples: Sequence[tuple[float, float]]) -> float:
     mb = [value for _, value in samples]
     third = max(1, len(mb) // 3)
     return median(mb[-third:]) - median(mb[:third])
+
+
+def wait_for_calm(busy_cores: float, patience_s: float) -> None:
+    """Return when the machine has been less busy than this for a while, or when patience ends."""
+    until_s = time.monotonic() + patience_s
+    while time.monotonic() < until_s:
+        before_s = _machine_s()
+        time.sleep(_CALM_S)
+        if _machine_s() - before_s < busy_cores * _CALM_S:
+            return
 
 
 def _machine_s() -> float:
