@@ -58,9 +58,8 @@ def _rig(section: Section) -> str:
 Frames of {section["frame_kib"]:.0f} KiB ({section["frames"]}), encoded once, played by one process
 through the agents' uplink over loopback UDP, each camera at a phase of its own; the server is a process of
 its own, decodes and demosaics every frame, and its sets are taken as by a user's program.
-{section["expected_sets"]} sets. Of up to {section["tries"]} runs the one that other programs disturbed least:
-they took {section["others_cores"]:.2f} cores, the sender {section["sender_cores"]:.2f}. Loopback
-does the kernel's part of receiving in the sender.
+{section["expected_sets"]} sets. Of up to {section["tries"]} runs the one that other programs disturbed least.
+The sender took {section["sender_cores"]:.2f} cores; loopback does the kernel's part of receiving in it.
 
 {table}
 
@@ -181,6 +180,7 @@ _RIG_ROWS: Sequence[tuple[str, Callable[[Section], str], str]] = (
     ("last datagram → set, p99 ms", lambda one: f"{one['p99_ms']:.1f}", "≤ 20"),
     ("memory growth, MB", lambda one: f"{one['rss_growth_mb']:+.1f} of {one['rss_mb']:.0f}", "flat"),
     ("page faults a second", lambda one: f"{one['minor_faults_per_s']:.0f}", ""),
+    ("cores that other programs took meanwhile", lambda one: f"{one['others_cores']:.2f}", ""),
     ("authenticated", lambda one: "yes" if one["authenticated"] else "no", "yes"),
 )
 
