@@ -70,7 +70,9 @@ class LivePipeline:
             on_turn=self._streams.turn,
         )
         # After the port is ours: its first construction on a machine compiles for seconds.
-        self._decoder = FrameDecoder(self._assembler.add, threads=settings.decoder_threads)
+        self._decoder = FrameDecoder(
+            self._assembler.add, threads=settings.decoder_threads, demosaic=settings.demosaic
+        )
         self._rates = RateMeter()
         self._presence = threading.Lock()  # guards what follows
         self._connected: set[int] = set()
