@@ -1,6 +1,6 @@
 """What every codec is made of: the image header, bounds, and compression of byte streams.
 
-A payload opens with `version u8 = 1, zero u8, height u16, width u16` (little-endian), see CODECS.md.
+A payload opens with `version u8 = 2, zero u8, height u16, width u16` (little-endian), see CODECS.md.
 """
 
 import importlib
@@ -20,7 +20,7 @@ ImageKind = Literal["bayer", "bgr", "grey", "raw", "depth_mm"]
 Image = npt.NDArray[Any]
 Bytes = bytes | memoryview
 
-VERSION = 1
+VERSION = 2
 MAX_SIDE = 4096
 """Longest image side in pixels: three times a Kinect's, and it bounds what a decoder allocates."""
 
@@ -110,7 +110,7 @@ def decoding_kernels() -> ModuleType:
         ) from error
 
 
-def compress(streams: Sequence[npt.NDArray[np.uint8]], hash_log: int) -> bytes:
+def compress(streams: Sequence[npt.NDArray[np.uint8]]) -> bytes:
     """One zstd frame that holds the streams one after another, a fresh entropy table for each.
 
     Residuals are noise: a small hash table and long matches leave them to the entropy coder, which
@@ -119,7 +119,7 @@ def compress(streams: Sequence[npt.NDArray[np.uint8]], hash_log: int) -> bytes:
     """
     size = sum(stream.size for stream in streams)
     parameters = zstandard.ZstdCompressionParameters.from_level(
-        1, source_size=size, hash_log=hash_log, min_match=7
+        1, source_size=size, hash_log=6, min_match=7
     )
     compressor = zstandard.ZstdCompressor(compression_params=parameters).compressobj(size=size)
     chunks = []
