@@ -43,8 +43,10 @@ class BayerCodec:
     def decode(self, data: Bytes) -> Image:
         """Needs Numba."""
         height, width, body = unpack_header(data)
-        mosaic = np.empty(pyramid.padded_shape(height, width, 2 * BLOCK), np.uint8)
-        decoding_kernels().restore_mosaic(decompress(body, mosaic.size), mosaic)
+        rows, columns = pyramid.padded_shape(height, width, 2 * BLOCK)
+        residuals = decompress(body, rows * columns)
+        mosaic = np.empty((rows, columns), np.uint8)
+        decoding_kernels().restore_mosaic(residuals, mosaic)
         return np.ascontiguousarray(mosaic[:height, :width])
 
 

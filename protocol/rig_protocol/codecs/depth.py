@@ -130,7 +130,7 @@ def _surface_streams(image: ImageU16, none: int) -> tuple[ImageU8, ImageU8, Imag
     zigzag[valid] = ((steps << 1) ^ (steps >> 15)).view(np.uint16)
     zigzag = np.asarray(cv2.transpose(zigzag), np.uint16)[1:]
     escapes = zigzag[zigzag >= _ESCAPE] - _ESCAPE
-    mask = cv2.transpose(np.packbits(valid[:, 1:], axis=1, bitorder="little"))
+    mask = np.asarray(cv2.transpose(np.packbits(valid[:, 1:], axis=1, bitorder="little")), np.uint8)
     return mask, _pack_codes(zigzag), np.concatenate([escapes & 255, escapes >> 8]).astype(np.uint8)
 
 

@@ -30,8 +30,15 @@ _ZERO, _ONE = np.uint8(0), np.uint8(1)
 _BAND = 8
 """Rows whose measured pixels share the bytes of a depth image's mask."""
 
+_DE_BRUIJN = np.uint64(0x03F7_9D71_B4CB_0A89)
+"""Its products with the 64 powers of two differ in their upper six bits, each of which so names a bit."""
+_PIXEL_OF_BIT = np.zeros(64, np.uint8)
+for _bit in range(64):
+    _PIXEL_OF_BIT[(int(_DE_BRUIJN) << _bit & 2**64 - 1) >> 58] = _bit // 2
+
 _STREAM = types.Array(uint8, 1, "C", readonly=True)
 _STREAM_IMAGE = types.Array(uint8, 2, "C", readonly=True)
+_COUNTS = types.Tuple((int64, int64))  # type: ignore[no-untyped-call]  # Numba leaves it so
 
 
 def _compiled(signature: object) -> Callable[[Callable[P, R]], Callable[P, R]]:
@@ -161,45 +168,53 @@ def _unpack_codes(codes: U8, steps: U64, escaped: U8) -> None:
     for x in range(codes.size):
         escaped[x] = codes[x] & (codes[x] >> _ONE) & np.uint8(0b01010101)
         word = np.uint64(codes[x])
-        word = (word | (word << np.uint64(28))) & (np.uint64(0xF) * four & np.uint64(0xF_0000_000F))
-        word = (word | (word << np.uint64(14))) & (np.uint64(3) * four)
+        word = (word | (word << np.uint64(28))) & np.uint64(0x0000_000F_0000_000F)
+        word = (word | (word << np.uint64(14))) & np.uint64(0x0003_0003_0003_0003)
         low, high = word & four, (word >> np.uint64(1)) & four
         minus_one = low & ~high
         steps[x] = (high & ~low) | ((minus_one << np.uint64(16)) - minus_one)
 
 
 @_inlined
-def _insert_escapes(escaped: U8, escapes: U8, used: int, steps: U16) -> int:
+def _unpack_escapes(escapes: U8) -> U16:
+    """Steps of zigzag − 3 in low bytes, high bytes."""
+    steps = np.empty(escapes.shape[1], np.uint16)
+    for x in range(steps.size):
+        zigzag = np.uint16(escapes[0, x] + 256 * escapes[1, x] + 3)
+        steps[x] = np.uint16((zigzag >> 1) ^ -(zigzag & 1))
+    return steps
+
+
+@_inlined
+def _insert_escapes(escaped: U8, escapes: U16, used: int, steps: U16) -> int:
     """Put escaped steps in their places; returns how many escapes the surface has asked for.
 
-    One step in thirty is escaped, so that most words of eight bytes are zero.
+    One step in thirty is escaped: most words of 32 pixels are zero.
     """
     words = escaped.view(np.uint64)
-    for word in range(words.size):
-        if words[word] == 0:
-            continue
-        for byte in range(8 * word, 8 * word + 8):
-            if escaped[byte] == 0:
-                continue
-            for place in range(4):
-                if (escaped[byte] >> (2 * place)) & 1:
-                    if used < escapes.shape[1]:
-                        zigzag = escapes[0, used] + 256 * escapes[1, used] + 3
-                        steps[4 * byte + place] = np.uint16((zigzag >> 1) ^ -(zigzag & 1))
-                    used += 1
+    for index in range(words.size):
+        word = words[index]
+        while word != np.uint64(0):
+            lowest_bit = word & (~word + np.uint64(1))
+            word ^= lowest_bit
+            if used < escapes.size:
+                steps[32 * index + _PIXEL_OF_BIT[(lowest_bit * _DE_BRUIJN) >> np.uint64(58)]] = escapes[used]
+            used += 1
     return used
 
 
 @_inlined
-def _add_row(steps: U16, mask: U8, bit: np.uint8, none: np.uint16, last: U16, row: U16) -> None:
-    """Each column's next value where there is a measurement; `last` are the values so far."""
+def _add_row(steps: U16, mask: U8, bit: np.uint8, none: np.uint16, last: U16, row: U16) -> np.uint16:
+    """Each column's next value where there is a measurement, and the largest; `last` are those before."""
+    largest = np.uint16(0)
     for x in range(row.size):
-        value = np.uint16(last[x] + steps[x])
-        last[x] = value
-        row[x] = value if mask[x] & bit else none
+        last[x] = np.uint16(last[x] + steps[x])
+        row[x] = last[x] if mask[x] & bit else none
+        largest = max(largest, row[x])
+    return largest
 
 
-@_compiled(types.UniTuple(int64, 2)(_STREAM_IMAGE, _STREAM_IMAGE, _STREAM_IMAGE, uint16, uint16[:, ::1]))
+@_compiled(_COUNTS(_STREAM_IMAGE, _STREAM_IMAGE, _STREAM_IMAGE, uint16, uint16[:, ::1]))
 def restore_surface(mask: U8, codes: U8, escapes: U8, none: np.uint16, surface: U16) -> tuple[int, int]:
     """Fill `surface` from its mask, 2-bit codes and escapes (low bytes, high bytes).
 
@@ -211,6 +226,7 @@ def restore_surface(mask: U8, codes: U8, escapes: U8, none: np.uint16, surface: 
     words, escaped = np.zeros(_BAND * stride, np.uint64), np.zeros(_BAND * stride, np.uint8)
     steps = words.view(np.uint16)
     last = np.zeros(width, np.uint16)
+    jumps = _unpack_escapes(escapes)
     used, largest = 0, np.uint16(0)
     for top in range(0, height, _BAND):
         rows = min(_BAND, height - top)
@@ -218,10 +234,9 @@ def restore_surface(mask: U8, codes: U8, escapes: U8, none: np.uint16, surface: 
             escaped[:] = 0
         band = codes[top : top + rows].reshape(rows * stride)
         _unpack_codes(band, words, escaped)
-        used = _insert_escapes(escaped, escapes, used, steps)
+        used = _insert_escapes(escaped, jumps, used, steps)
         for y in range(rows):
-            row = surface[top + y]
-            _add_row(steps[4 * stride * y :], mask[top // _BAND], np.uint8(1 << y), none, last, row)
-            for x in range(width):
-                largest = max(largest, row[x])
-    return used, int64(largest)
+            row_steps, bit = steps[4 * stride * y :], np.uint8(1 << y)
+            in_row = _add_row(row_steps, mask[top // _BAND], bit, none, last, surface[top + y])
+            largest = max(largest, in_row)
+    return used, int(largest)

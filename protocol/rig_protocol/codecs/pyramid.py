@@ -7,6 +7,8 @@ the usual prediction from left and above. No pixel depends on the one before it 
 so that both sides run in vector units, a byte a pixel. `kernels.py` is the decoding side.
 """
 
+from typing import Literal
+
 import cv2
 import numpy as np
 
@@ -66,17 +68,38 @@ def residuals(planes: ImageU8) -> ImageU8:
 def predictions(corners: ImageU8, centres: ImageU8) -> tuple[ImageU8, ImageU8, ImageU8]:
     """Predictions of the centres, of the pixels to the right of the corners, and of those below them.
 
-    Each is of four neighbours in two pairs, and most pairs serve two of the predictions.
+    Each is of four neighbours in two pairs, and most pairs serve two of the predictions. The sums run over
+    framed grids as one line: `pitch` further on is the next row, and what joins two rows lies in the frame.
     """
-    known = np.pad(corners, ((0, 0), (0, 1), (0, 1)), mode="edge")
-    around = np.pad(centres, ((0, 0), (1, 0), (1, 0)), mode="edge")
-    low, high = _sorted(known[:, :, :-1], known[:, :, 1:])
-    at_centres = _middle(low[:, :-1], high[:, :-1], low[:, 1:], high[:, 1:])
-    beside = _sorted(around[:, :-1, 1:], centres)
-    at_columns = _middle(low[:, :-1], high[:, :-1], *beside)
-    above = _sorted(corners, known[:, 1:, :-1])
-    at_rows = _middle(*above, *_sorted(around[:, 1:, :-1], centres))
-    return at_centres, at_columns, at_rows
+    count, height, width = corners.shape
+    pitch = width + 1
+    corner, centre = _framed(corners, 0), _framed(centres, 1)
+    low, high = _sorted(corner[:-1], corner[1:])
+    beside = low[:-pitch], high[:-pitch]
+    at_centres = _middle(*beside, low[pitch:], high[pitch:])
+    at_columns = _middle(*beside, *_sorted(centre[1:-pitch], centre[pitch + 1 :]))
+    below = _sorted(corner[: -pitch - 1], corner[pitch:-1])
+    at_rows = _middle(*below, *_sorted(centre[pitch:-1], centre[pitch + 1 :]))
+    lines = (at_centres, at_columns, at_rows)
+    grids = [line.reshape(count, height + 1, pitch)[:, :height, :width] for line in lines]
+    return grids[0], grids[1], grids[2]
+
+
+def _framed(planes: ImageU8, start: Literal[0, 1]) -> ImageU8:
+    """Planes as one line, each framed by a repeated row and column: after it, or before it if `start` is 1.
+
+    The line is a row and a pixel longer than that, so that the last pixel has its neighbours.
+    """
+    count, height, width = planes.shape
+    pitch, size = width + 1, count * (height + 1) * (width + 1)
+    line = np.empty(size + pitch + 1, np.uint8)
+    line[size:] = 0
+    framed = line[:size].reshape(count, height + 1, pitch)
+    framed[:, start : start + height, start : start + width] = planes
+    edge, inner = (0, 1) if start else (-1, -2)
+    framed[:, :, edge] = framed[:, :, inner]
+    framed[:, edge] = framed[:, inner]
+    return line
 
 
 def _sorted(a: ImageU8, b: ImageU8) -> tuple[ImageU8, ImageU8]:
@@ -86,7 +109,7 @@ def _sorted(a: ImageU8, b: ImageU8) -> tuple[ImageU8, ImageU8]:
 def _middle(low_a: ImageU8, high_a: ImageU8, low_b: ImageU8, high_b: ImageU8) -> ImageU8:
     """Mean, rounded up, of the middle two of two sorted pairs; it takes no more than eight bits."""
     mean, other = np.maximum(low_a, low_b), np.minimum(high_a, high_b)
-    half = mean ^ other
+    half = np.bitwise_xor(mean, other)
     half >>= 1
     mean |= other
     mean -= half
