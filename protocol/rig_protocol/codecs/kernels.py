@@ -78,11 +78,18 @@ def _interleave(even: U8, odd: U8, row: U8) -> None:
 
 
 @_inlined
+def _copy_row(source: U8, row: U8) -> None:
+    for x in range(row.size):
+        row[x] = source[x]
+
+
+@_inlined
 def _repeat_edges(plane: U8) -> None:
     """Fill the last row and column with those before them."""
-    for y in range(plane.shape[0] - 1):
-        plane[y, -1] = plane[y, -2]
-    plane[-1] = plane[-2]
+    height, width = plane.shape[0] - 1, plane.shape[1] - 1
+    for y in range(height):
+        plane[y, width] = plane[y, width - 1]
+    _copy_row(plane[height - 1], plane[height])
 
 
 @_inlined
@@ -100,7 +107,7 @@ def _refine(corners: U8, at_centres: U8, at_columns: U8, at_rows: U8, offset: np
         _restore_row(left, right, under_left, under_right, at_centres[y], _ZERO, centres[1:])
         centres[0] = centres[1]
         if y == 0:
-            above[:] = centres
+            _copy_row(centres, above)
         _restore_row(left, right, centres[1:], above[1:], at_columns[y], offset, between)
         _interleave(left, between, finer[2 * y])
         _restore_row(left, under_left, centres[1:], centres[:-1], at_rows[y], offset, between)
@@ -142,7 +149,8 @@ def restore_planes(residuals: U8, planes: U8) -> None:
     """Fill planes (N, H, W) of whole blocks from their residuals (N, H·W)."""
     for index in range(len(planes)):
         plane = _restore_plane(residuals[index], planes.shape[1], planes.shape[2])
-        planes[index] = plane[:-1, :-1]
+        for y in range(planes.shape[1]):
+            _copy_row(plane[y], planes[index, y])
 
 
 @_compiled(void(_STREAM, uint8[:, ::1]))
@@ -231,7 +239,7 @@ def restore_surface(mask: U8, codes: U8, escapes: U8, none: np.uint16, surface: 
     for top in range(0, height, _BAND):
         rows = min(_BAND, height - top)
         if rows < _BAND:
-            escaped[:] = 0
+            escaped.fill(0)
         band = codes[top : top + rows].reshape(rows * stride)
         _unpack_codes(band, words, escaped)
         used = _insert_escapes(escaped, jumps, used, steps)
