@@ -2,6 +2,7 @@
 
 import subprocess
 import sys
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import cv2
@@ -178,6 +179,15 @@ def test_decoding_without_numba_says_what_to_install(monkeypatch: pytest.MonkeyP
     monkeypatch.setitem(sys.modules, "numba", None)
     with pytest.raises(ConfigurationError, match=r"numba.*kinect-rig\[server\]"):
         codec_by_name("bayer-lossless").decode(data)
+
+
+@every_lossless_codec
+def test_threads_decode_at_the_same_time(one: Codec) -> None:
+    images = [scene(one.image, 200, 300, seed) for seed in range(12)]
+    payloads = [one.encode(image) for image in images]
+    with ThreadPoolExecutor(4) as threads:
+        for decoded, image in zip(threads.map(one.decode, payloads), images, strict=True):
+            assert_same(decoded, image)
 
 
 def test_warming_up_loads_the_decoders() -> None:
