@@ -96,7 +96,7 @@ def _repeat_edges(plane: U8) -> None:
 def _refine(corners: U8, at_centres: U8, at_columns: U8, at_rows: U8, offset: np.uint8, finer: U8) -> None:
     """Fill a grid from every second pixel (H + 1, W + 1; edges repeated) and the residuals of the others.
 
-    `offset` is added to the pixels of odd columns and those of odd rows.
+    `offset` is added to the pixels between two corners.
     """
     height, width = corners.shape[0] - 1, corners.shape[1] - 1
     above, centres = np.empty(width + 1, np.uint8), np.empty(width + 1, np.uint8)  # the first is repeated
@@ -158,7 +158,8 @@ def restore_mosaic(residuals: U8, mosaic: U8) -> None:
     """Fill a mosaic of whole blocks (H, W) from its residuals (H·W).
 
     It is one more level: green in even rows is the coarser plane, and what a prediction of green misses
-    at red and at blue are planes themselves.
+    at red and at blue are planes themselves. Adding the 128 that they are stored with takes it away,
+    modulo 256.
     """
     height, width = mosaic.shape[0] // 2, mosaic.shape[1] // 2
     size = height * width
