@@ -1,0 +1,144 @@
+"""Sets that wait for their cameras: the policies partial and strict.
+
+Marked on a circle one period round, the exposures of free-running cameras leave gaps; the tightest set
+starts after the widest gap. The next exposure of each camera (its head: a frame that waits, or one that is
+expected) is a candidate; where starting a frame later for the earliest cameras would be tighter by more
+than the hysteresis, the cut moves there. That is also how a set follows a camera that slides by a frame, at
+the price of one frame of that camera, and why a slow camera is not waited for while none of its is due.
+"""
+
+from collections.abc import Sequence
+
+from rig_protocol.frames import RgbdFrame, mean_time_ns
+from rig_server.camera_queue import CameraQueue, Head
+from rig_server.rig_queues import RigQueues
+
+# Gain, in periods, below which the cut stays: above the jitter of software time stamps.
+_HYSTERESIS = 0.05
+
+
+class WaitingPolicy:
+    """Chooses sets whose cameras are all here, and what is here of sets that are overdue.
+
+    A frame waits one period and the deadline at most. Period: that of most cameras; when `strict`, that of
+    the slowest, and then a set that lacks a camera is no alternative to a later one.
+    """
+
+    def __init__(
+        self, queues: RigQueues, deadline_ns: int, max_spread_ns: int | None, *, strict: bool
+    ) -> None:
+        self._queues = queues
+        self._deadline_ns = deadline_ns
+        self._max_spread_ns = max_spread_ns
+        self._strict = strict
+        self._guessed = False  # a frame was skipped on a guess since the last set
+        self.blocker: CameraQueue | None = None
+        self.longest_wait_ns = 0
+        self._measure()
+
+    def choose(self, now_ns: int) -> dict[int, RgbdFrame] | None:
+        """Take the next set's frames; None when there is none: it waits for `blocker`, or nothing is here."""
+        period_ns = self._measure()
+        while holding := self._queues.holding:
+            heads, unknown = self._heads(holding)
+            chosen = self._cut(heads, period_ns)
+            if chosen is None:
+                continue
+            awaited = unknown + [head.queue for head in chosen if not head.here]
+            if awaited and not self._overdue(now_ns):
+                self.blocker = awaited[0] if unknown else awaited[-1]
+                return None
+            if self._strict and not self._due(chosen, unknown):
+                self._queues.skip([next(head.queue for head in chosen if head.here)])
+                continue
+            return self._take(chosen, awaited)
+        self.blocker = None
+        return None
+
+    def _measure(self) -> int:
+        queues = self._queues
+        period_ns = queues.longest_period_ns() if self._strict else queues.common_period_ns()
+        self.longest_wait_ns = period_ns + self._deadline_ns
+        self._width_ns = period_ns if self._max_spread_ns is None else self._max_spread_ns
+        return period_ns
+
+    def _overdue(self, now_ns: int) -> bool:
+        oldest_ns = self._queues.oldest_arrival_ns
+        waited = oldest_ns is not None and now_ns >= oldest_ns + self.longest_wait_ns
+        return waited or self._queues.crowded
+
+    def _heads(self, holding: Sequence[CameraQueue]) -> tuple[list[Head], list[CameraQueue]]:
+        """Heads that may share a set, earliest first, and awaited cameras of which nothing is known yet."""
+        earliest_ns = min(queue.pending[0].timestamp_ns for queue in holding) - self._width_ns
+        heads, unknown = [], []
+        for queue in self._queues.by_id.values():
+            head = queue.head(earliest_ns)
+            if head is not None:
+                heads.append(head)
+            elif queue.awaited:
+                unknown.append(queue)
+        heads.sort(key=_exposure_ns)
+        last_ns = heads[0].exposure_ns + self._width_ns
+        return [head for head in heads if head.exposure_ns <= last_ns], unknown
+
+    def _cut(self, window: Sequence[Head], period_ns: int) -> Sequence[Head] | None:
+        """The heads that make the next set; None when some of the earliest were left out: look again."""
+        cut = self._better_cut(window, _HYSTERESIS * period_ns)
+        early = window[:cut] or window
+        if not any(head.here for head in early):
+            for head in early:
+                head.queue.pass_over()
+            return None
+        if cut == 0:
+            return window
+        if 2 * cut >= len(window) and not self._strict:
+            # Leaving these out would lose most of a set: they go out without the others.
+            return early
+        if not all(head.here for head in window):
+            return window
+        self._guessed |= not all(head.following_here for head in early)
+        self._queues.skip([head.queue for head in early])
+        return None
+
+    def _better_cut(self, window: Sequence[Head], hysteresis_ns: float) -> int:
+        """How many of the earliest heads to leave out for a tighter set; 0 when this one is tight enough.
+
+        Guesses about frames to come may skip frames once a set: a camera that runs irregularly must
+        not keep the set from ever going out.
+        """
+        last_ns = window[-1].exposure_ns
+        best, best_spread_ns = 0, last_ns - window[0].exposure_ns - hysteresis_ns
+        guessed = False
+        for cut in range(1, len(window)):
+            before = window[cut - 1]
+            last_ns = max(last_ns, before.following_ns)
+            guessed = guessed or not before.following_here
+            if guessed and self._guessed and (self._strict or 2 * cut < len(window)):
+                continue
+            spread_ns = last_ns - window[cut].exposure_ns
+            if spread_ns < best_spread_ns:
+                best, best_spread_ns = cut, spread_ns
+        return best
+
+    def _due(self, chosen: Sequence[Head], unknown: Sequence[CameraQueue]) -> bool:
+        """False where a connected camera is not in this set because it is slower, not because it is late."""
+        newest_ns = max(queue.pending[-1].timestamp_ns for queue in self._queues.holding)
+        if unknown or any(not head.here and head.exposure_ns <= newest_ns for head in chosen):
+            return True
+        here = {head.queue for head in chosen if head.here}
+        return all(queue in here or not queue.awaited for queue in self._queues.by_id.values())
+
+    def _take(self, chosen: Sequence[Head], awaited: Sequence[CameraQueue]) -> dict[int, RgbdFrame]:
+        taken = {head.queue.camera_id: head.queue.pop() for head in chosen if head.here}
+        end_ns = max(frame.timestamp_ns for frame in taken.values())
+        for camera_id, queue in self._queues.by_id.items():
+            if camera_id not in taken:
+                queue.miss(end_ns, waited=queue in awaited)
+        self._queues.update_oldest()
+        self._queues.close(mean_time_ns(taken.values()))
+        self._guessed = False
+        return taken
+
+
+def _exposure_ns(head: Head) -> int:
+    return head.exposure_ns
