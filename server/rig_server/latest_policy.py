@@ -25,6 +25,9 @@ class LatestPolicy:
         self.blocker: CameraQueue | None = None
         self.longest_wait_ns = queues.common_period_ns()
 
+    def settle(self) -> None:
+        """Nothing is kept from set to set that other cameras would change."""
+
     def choose(self, now_ns: int) -> dict[int, RgbdFrame] | None:
         """Take the next set's frames; None when there is none: it waits for `blocker`, or nothing is here."""
         self.blocker = None

@@ -83,6 +83,7 @@ class Synchroniser:
     def camera_joined(self, camera_id: int, fps: float) -> None:
         """From now on sets wait for this camera, which says that it runs at `fps`."""
         self._queues[camera_id].join(fps)
+        self._policy.settle()
         self._stirred = True
 
     def camera_left(self, camera_id: int) -> None:

@@ -13,8 +13,13 @@ from rig_protocol.frames import RgbdFrame, mean_time_ns
 from rig_server.camera_queue import CameraQueue, Head
 from rig_server.rig_queues import RigQueues
 
-# Gain, in periods, below which the cut stays: above the jitter of software time stamps.
-_HYSTERESIS = 0.05
+# A move of the cut costs frames. In the first sets after a camera joined it is worth this gain of spread,
+# in periods (above the jitter of software time stamps), and once in so many sets later on ...
+_SMALL_GAIN = 0.05
+_SETTLING_SETS = 30
+_SETTLED_SETS = 1500
+# ... and at any time it is worth this gain.
+_LARGE_GAIN = 0.2
 
 
 class WaitingPolicy:
@@ -32,9 +37,15 @@ class WaitingPolicy:
         self._max_spread_ns = max_spread_ns
         self._strict = strict
         self._guessed = False  # a frame was skipped on a guess since the last set
+        self._settling = _SETTLING_SETS
+        self._since_move = 0
         self.blocker: CameraQueue | None = None
         self.longest_wait_ns = 0
         self._measure()
+
+    def settle(self) -> None:
+        """The cameras are not the same any more: look for the best cut anew."""
+        self._settling = _SETTLING_SETS
 
     def choose(self, now_ns: int) -> dict[int, RgbdFrame] | None:
         """Take the next set's frames; None when there is none: it waits for `blocker`, or nothing is here."""
@@ -45,10 +56,10 @@ class WaitingPolicy:
             if chosen is None:
                 continue
             awaited = unknown + [head.queue for head in chosen if not head.here]
-            if awaited and not self._overdue(now_ns):
+            if awaited and not (self._overdue(now_ns) or self._queues.crowded):
                 self.blocker = awaited[0] if unknown else awaited[-1]
                 return None
-            if self._strict and not self._due(chosen, unknown):
+            if self._strict and not (unknown or self._complete(chosen) or self._hopeless(chosen, now_ns)):
                 self._queues.skip([next(head.queue for head in chosen if head.here)])
                 continue
             return self._take(chosen, awaited)
@@ -64,8 +75,7 @@ class WaitingPolicy:
 
     def _overdue(self, now_ns: int) -> bool:
         oldest_ns = self._queues.oldest_arrival_ns
-        waited = oldest_ns is not None and now_ns >= oldest_ns + self.longest_wait_ns
-        return waited or self._queues.crowded
+        return oldest_ns is not None and now_ns >= oldest_ns + self.longest_wait_ns
 
     def _heads(self, holding: Sequence[CameraQueue]) -> tuple[list[Head], list[CameraQueue]]:
         """Heads that may share a set, earliest first, and awaited cameras of which nothing is known yet."""
@@ -83,7 +93,9 @@ class WaitingPolicy:
 
     def _cut(self, window: Sequence[Head], period_ns: int) -> Sequence[Head] | None:
         """The heads that make the next set; None when some of the earliest were left out: look again."""
-        cut = self._better_cut(window, _HYSTERESIS * period_ns)
+        common_ns = self._queues.common_period_ns()
+        free = self._settling > 0 or self._since_move >= _SETTLED_SETS
+        cut = self._better_cut(window, (_SMALL_GAIN if free else _LARGE_GAIN) * common_ns)
         early = window[:cut] or window
         if not any(head.here for head in early):
             for head in early:
@@ -93,12 +105,20 @@ class WaitingPolicy:
             return window
         if 2 * cut >= len(window) and not self._strict:
             # Leaving these out would lose most of a set: they go out without the others.
+            if all(head.here for head in early):
+                self._note_move(window[cut:], period_ns)
             return early
         if not all(head.here for head in window):
             return window
+        self._note_move(early, period_ns)
         self._guessed |= not all(head.following_here for head in early)
         self._queues.skip([head.queue for head in early])
         return None
+
+    def _note_move(self, without: Sequence[Head], period_ns: int) -> None:
+        """A camera of the common rate lost its place in a set; slower and faster ones do all the time."""
+        if any(2 * period_ns < 3 * head.queue.rate.period_ns < 4 * period_ns for head in without):
+            self._since_move = 0
 
     def _better_cut(self, window: Sequence[Head], hysteresis_ns: float) -> int:
         """How many of the earliest heads to leave out for a tighter set; 0 when this one is tight enough.
@@ -120,13 +140,16 @@ class WaitingPolicy:
                 best, best_spread_ns = cut, spread_ns
         return best
 
-    def _due(self, chosen: Sequence[Head], unknown: Sequence[CameraQueue]) -> bool:
-        """False where a connected camera is not in this set because it is slower, not because it is late."""
-        newest_ns = max(queue.pending[-1].timestamp_ns for queue in self._queues.holding)
-        if unknown or any(not head.here and head.exposure_ns <= newest_ns for head in chosen):
-            return True
+    def _complete(self, chosen: Sequence[Head]) -> bool:
+        """True when the set holds a frame of every camera that can be waited for."""
         here = {head.queue for head in chosen if head.here}
         return all(queue in here or not queue.awaited for queue in self._queues.by_id.values())
+
+    def _hopeless(self, chosen: Sequence[Head], now_ns: int) -> bool:
+        """True when a camera's frame is late; False when it is slower and the first frame is a surplus one."""
+        late_ns = max(queue.pending[-1].timestamp_ns for queue in self._queues.holding)
+        late_ns -= self._queues.common_period_ns()
+        return self._overdue(now_ns) or any(not head.here and head.exposure_ns < late_ns for head in chosen)
 
     def _take(self, chosen: Sequence[Head], awaited: Sequence[CameraQueue]) -> dict[int, RgbdFrame]:
         taken = {head.queue.camera_id: head.queue.pop() for head in chosen if head.here}
@@ -137,6 +160,8 @@ class WaitingPolicy:
         self._queues.update_oldest()
         self._queues.close(mean_time_ns(taken.values()))
         self._guessed = False
+        self._settling -= self._settling > 0
+        self._since_move += 1
         return taken
 
 
