@@ -8,6 +8,8 @@ from rig_server.frame_rate import FrameRate
 
 # Frames that may wait for one camera: a deadline of 200 ms at 30 Hz, and 8 × 0.9 MB of memory.
 MAX_PENDING = 8
+# Periods that the frames of a full queue span at least when it is the sets that are late.
+_CROWDED_PERIODS = 3
 # Sets in a row that wait in vain for a camera; then none does until it delivers again. A second at 30 Hz.
 _PATIENCE = 30
 # No exposure time lies before this.
@@ -58,10 +60,11 @@ class CameraQueue:
         """False for a camera that is not connected, or that has not delivered in time for a second."""
         return self.live and self._waited_in_vain < _PATIENCE
 
-    @property
-    def full(self) -> bool:
-        """True when the next frame finds no room."""
-        return len(self.pending) >= MAX_PENDING
+    def crowded(self, period_ns: int) -> bool:
+        """True when no room is left and sets must go; a fast camera whose surplus frames fill it waits on."""
+        if len(self.pending) < MAX_PENDING:
+            return False
+        return self.pending[-1].timestamp_ns - self.pending[0].timestamp_ns >= _CROWDED_PERIODS * period_ns
 
     def join(self, fps: float) -> None:
         """The camera is connected, at a phase that nobody knows yet."""

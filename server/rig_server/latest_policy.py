@@ -23,7 +23,12 @@ class LatestPolicy:
         self._max_spread_ns = max_spread_ns
         self._last_set_ns: int | None = None
         self.blocker: CameraQueue | None = None
-        self.longest_wait_ns = queues.common_period_ns()
+        self.period_ns = queues.common_period_ns()
+
+    @property
+    def longest_wait_ns(self) -> int:
+        """How long a frame waits at most."""
+        return self.period_ns
 
     def settle(self) -> None:
         """Nothing is kept from set to set that other cameras would change."""
@@ -31,10 +36,10 @@ class LatestPolicy:
     def choose(self, now_ns: int) -> dict[int, RgbdFrame] | None:
         """Take the next set's frames; None when there is none: it waits for `blocker`, or nothing is here."""
         self.blocker = None
-        self.longest_wait_ns = self._queues.common_period_ns()
+        self.period_ns = self._queues.common_period_ns()
         while holding := self._queues.holding:
             awaited = self._awaited(holding)
-            if awaited and not self._overdue(now_ns):
+            if awaited and not self._queues.overdue(now_ns, self.longest_wait_ns):
                 self.blocker = awaited[-1]
                 return None
             for queue in awaited:
@@ -43,14 +48,10 @@ class LatestPolicy:
                 return taken
         return None
 
-    def _overdue(self, now_ns: int) -> bool:
-        oldest_ns = self._queues.oldest_arrival_ns
-        return self._queues.crowded or (oldest_ns is not None and now_ns >= oldest_ns + self.longest_wait_ns)
-
     def _awaited(self, holding: Sequence[CameraQueue]) -> list[CameraQueue]:
         """Cameras without a new frame that should send one within the period."""
         first_ns = min(queue.pending[0].timestamp_ns for queue in holding)
-        from_ns, to_ns = first_ns - self.longest_wait_ns // 2, first_ns + self.longest_wait_ns
+        from_ns, to_ns = first_ns - self.period_ns // 2, first_ns + self.period_ns
         return [
             queue
             for queue in self._queues.by_id.values()

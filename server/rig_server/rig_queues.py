@@ -48,10 +48,13 @@ class RigQueues:
         """The queues with a frame."""
         return [queue for queue in self.by_id.values() if queue.pending]
 
-    @property
-    def crowded(self) -> bool:
-        """True when a camera's next frame finds no room."""
-        return any(queue.full for queue in self.by_id.values())
+    def overdue(self, now_ns: int, longest_wait_ns: int) -> bool:
+        """True when a frame has waited for so long."""
+        return self.oldest_arrival_ns is not None and now_ns >= self.oldest_arrival_ns + longest_wait_ns
+
+    def crowded(self, period_ns: int) -> bool:
+        """True when a camera's frames of several periods fill its queue."""
+        return any(queue.crowded(period_ns) for queue in self.by_id.values())
 
     def insert(self, frame: RgbdFrame, now_ns: int) -> None:
         """Let a frame wait; when there is no room, the camera's oldest one is skipped."""

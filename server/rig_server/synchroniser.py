@@ -93,7 +93,8 @@ class Synchroniser:
 
     def late(self, camera_id: int) -> int:
         """Frames of one camera that came after their set had gone."""
-        return self._queues[camera_id].late
+        queue = self._queues.by_id.get(camera_id)
+        return 0 if queue is None else queue.late
 
     def add(self, frame: RgbdFrame, now_ns: int) -> None:
         """Take a frame stamped in rig time; what comes too late or is implausible is counted."""
@@ -136,7 +137,7 @@ class Synchroniser:
     def _may_complete(self, queue: CameraQueue) -> bool:
         """Whether this camera's frame is worth a look: the next set waits for it, or its queue is full."""
         blocker = self._policy.blocker
-        return blocker is None or blocker is queue or queue.full
+        return blocker is None or blocker is queue or queue.crowded(self._policy.period_ns)
 
     def _panorama(self, taken: dict[int, RgbdFrame]) -> PanoramicFrame:
         live = {camera_id for camera_id, queue in self._queues.by_id.items() if queue.live}

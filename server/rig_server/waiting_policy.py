@@ -40,8 +40,12 @@ class WaitingPolicy:
         self._settling = _SETTLING_SETS
         self._since_move = 0
         self.blocker: CameraQueue | None = None
-        self.longest_wait_ns = 0
         self._measure()
+
+    @property
+    def longest_wait_ns(self) -> int:
+        """How long a frame waits at most."""
+        return self.period_ns + self._deadline_ns
 
     def settle(self) -> None:
         """The cameras are not the same any more: look for the best cut anew."""
@@ -49,33 +53,28 @@ class WaitingPolicy:
 
     def choose(self, now_ns: int) -> dict[int, RgbdFrame] | None:
         """Take the next set's frames; None when there is none: it waits for `blocker`, or nothing is here."""
-        period_ns = self._measure()
+        self._measure()
         while holding := self._queues.holding:
             heads, unknown = self._heads(holding)
-            chosen = self._cut(heads, period_ns)
+            chosen = self._cut(heads)
             if chosen is None:
                 continue
             awaited = unknown + [head.queue for head in chosen if not head.here]
-            if awaited and not (self._overdue(now_ns) or self._queues.crowded):
+            overdue = self._queues.overdue(now_ns, self.longest_wait_ns)
+            if awaited and not (overdue or self._queues.crowded(self.period_ns)):
                 self.blocker = awaited[0] if unknown else awaited[-1]
                 return None
-            if self._strict and not (unknown or self._complete(chosen) or self._hopeless(chosen, now_ns)):
+            if self._strict and not (overdue or unknown or self._complete(chosen) or self._late(chosen)):
                 self._queues.skip([next(head.queue for head in chosen if head.here)])
                 continue
             return self._take(chosen, awaited)
         self.blocker = None
         return None
 
-    def _measure(self) -> int:
-        queues = self._queues
-        period_ns = queues.longest_period_ns() if self._strict else queues.common_period_ns()
-        self.longest_wait_ns = period_ns + self._deadline_ns
-        self._width_ns = period_ns if self._max_spread_ns is None else self._max_spread_ns
-        return period_ns
-
-    def _overdue(self, now_ns: int) -> bool:
-        oldest_ns = self._queues.oldest_arrival_ns
-        return oldest_ns is not None and now_ns >= oldest_ns + self.longest_wait_ns
+    def _measure(self) -> None:
+        self._common_period_ns = self._queues.common_period_ns()
+        self.period_ns = self._queues.longest_period_ns() if self._strict else self._common_period_ns
+        self._width_ns = self.period_ns if self._max_spread_ns is None else self._max_spread_ns
 
     def _heads(self, holding: Sequence[CameraQueue]) -> tuple[list[Head], list[CameraQueue]]:
         """Heads that may share a set, earliest first, and awaited cameras of which nothing is known yet."""
@@ -91,11 +90,10 @@ class WaitingPolicy:
         last_ns = heads[0].exposure_ns + self._width_ns
         return [head for head in heads if head.exposure_ns <= last_ns], unknown
 
-    def _cut(self, window: Sequence[Head], period_ns: int) -> Sequence[Head] | None:
+    def _cut(self, window: Sequence[Head]) -> Sequence[Head] | None:
         """The heads that make the next set; None when some of the earliest were left out: look again."""
-        common_ns = self._queues.common_period_ns()
         free = self._settling > 0 or self._since_move >= _SETTLED_SETS
-        cut = self._better_cut(window, (_SMALL_GAIN if free else _LARGE_GAIN) * common_ns)
+        cut = self._better_cut(window, (_SMALL_GAIN if free else _LARGE_GAIN) * self._common_period_ns)
         early = window[:cut] or window
         if not any(head.here for head in early):
             for head in early:
@@ -106,18 +104,19 @@ class WaitingPolicy:
         if 2 * cut >= len(window) and not self._strict:
             # Leaving these out would lose most of a set: they go out without the others.
             if all(head.here for head in early):
-                self._note_move(window[cut:], period_ns)
+                self._note_move(window[cut:])
             return early
         if not all(head.here for head in window):
             return window
-        self._note_move(early, period_ns)
+        self._note_move(early)
         self._guessed |= not all(head.following_here for head in early)
         self._queues.skip([head.queue for head in early])
         return None
 
-    def _note_move(self, without: Sequence[Head], period_ns: int) -> None:
+    def _note_move(self, without: Sequence[Head]) -> None:
         """A camera of the common rate lost its place in a set; slower and faster ones do all the time."""
-        if any(2 * period_ns < 3 * head.queue.rate.period_ns < 4 * period_ns for head in without):
+        ratios = (head.queue.rate.period_ns / self._common_period_ns for head in without)
+        if any(2 / 3 < ratio < 3 / 2 for ratio in ratios):
             self._since_move = 0
 
     def _better_cut(self, window: Sequence[Head], hysteresis_ns: float) -> int:
@@ -145,11 +144,11 @@ class WaitingPolicy:
         here = {head.queue for head in chosen if head.here}
         return all(queue in here or not queue.awaited for queue in self._queues.by_id.values())
 
-    def _hopeless(self, chosen: Sequence[Head], now_ns: int) -> bool:
-        """True when a camera's frame is late; False when it is slower and the first frame is a surplus one."""
+    def _late(self, chosen: Sequence[Head]) -> bool:
+        """True when a camera's frame should be here; False where the camera is slower and others' surplus."""
         late_ns = max(queue.pending[-1].timestamp_ns for queue in self._queues.holding)
-        late_ns -= self._queues.common_period_ns()
-        return self._overdue(now_ns) or any(not head.here and head.exposure_ns < late_ns for head in chosen)
+        late_ns -= self._common_period_ns
+        return any(not head.here and head.exposure_ns < late_ns for head in chosen)
 
     def _take(self, chosen: Sequence[Head], awaited: Sequence[CameraQueue]) -> dict[int, RgbdFrame]:
         taken = {head.queue.camera_id: head.queue.pop() for head in chosen if head.here}
@@ -160,7 +159,7 @@ class WaitingPolicy:
         self._queues.update_oldest()
         self._queues.close(mean_time_ns(taken.values()))
         self._guessed = False
-        self._settling -= self._settling > 0
+        self._settling = max(self._settling - 1, 0)
         self._since_move += 1
         return taken
 
