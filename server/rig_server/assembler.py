@@ -124,6 +124,11 @@ class Assembler:
         return self._synchroniser.counters.implausible
 
     @property
+    def waiting(self) -> int:
+        """Frames that wait for their set."""
+        return self._synchroniser.waiting
+
+    @property
     def recent(self) -> tuple[SetRecord, ...]:
         """The last sets that went out, oldest first."""
         with self._set_ready:

@@ -80,6 +80,11 @@ class Synchroniser:
         """How long a frame that comes now waits for its set at most."""
         return self._policy.longest_wait_ns
 
+    @property
+    def waiting(self) -> int:
+        """Frames that wait for their set."""
+        return sum(len(queue.pending) for queue in list(self._queues.by_id.values()))
+
     def camera_joined(self, camera_id: int, fps: float) -> None:
         """From now on sets wait for this camera, which says that it runs at `fps`."""
         self._queues[camera_id].join(fps)
@@ -115,6 +120,7 @@ class Synchroniser:
         due_ns = self.next_timeout_ns()
         if not self._stirred and (due_ns is None or now_ns < due_ns):
             return None
+        self._stirred = True  # behind an overdue set there may be others
         while (taken := self._policy.choose(now_ns)) is not None:
             panorama = self._panorama(taken)
             if panorama.complete:
