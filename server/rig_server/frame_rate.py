@@ -4,10 +4,11 @@ from collections import deque
 
 # Intervals that a period is taken from: a change of rate is followed within so many frames.
 _INTERVALS = 9
-# Rank of the interval that counts as a single one: right as long as a third of the frames come.
+# Rank of the interval that counts as a single one: three of nine that lost no frame are enough, and two
+# that are too short by a fault do no harm.
 _SINGLE = 2
-# Longer than the single interval by this: a frame was lost in between.
-_GAP = 1.5
+# Longer than the single interval by this factor: a frame was lost in between; shorter: a fault.
+_RATIO = 1.5
 # A stamp older than the newest by more than this is no late frame: the camera's clock was set back.
 _SET_BACK_NS = 1_000_000_000
 
@@ -32,9 +33,10 @@ class FrameRate:
         elif timestamp_ns > newest_ns:
             self._newest_ns = timestamp_ns
             self._intervals_ns.append(timestamp_ns - newest_ns)
-            limit_ns = _GAP * sorted(self._intervals_ns)[_SINGLE]
-            single = [interval for interval in self._intervals_ns if interval < limit_ns]
-            self.period_ns = sum(single) // len(single)
+            single_ns = sorted(self._intervals_ns)[_SINGLE]
+            least_ns, most_ns = single_ns / _RATIO, single_ns * _RATIO
+            similar = [interval for interval in self._intervals_ns if least_ns < interval < most_ns]
+            self.period_ns = sum(similar) // len(similar)
 
 
 def period_of(fps: float) -> int:
