@@ -2,6 +2,8 @@
 
 from collections import deque
 
+from rig_protocol.message_bytes import MAX_FPS, MIN_FPS
+
 # Intervals that a period is taken from: a change of rate is followed within so many frames.
 _INTERVALS = 9
 # Rank of the interval that counts as a single one: three of nine that lost no frame are enough, and two
@@ -9,6 +11,8 @@ _INTERVALS = 9
 _SINGLE = 2
 # Longer than the single interval by this factor: a frame was lost in between; shorter: a fault.
 _RATIO = 1.5
+# No camera is faster or slower than a hello may say, whatever its stamps say.
+_SHORTEST_NS, _LONGEST_NS = round(1e9 / MAX_FPS), round(1e9 / MIN_FPS)
 # A stamp older than the newest by more than this is no late frame: the camera's clock was set back.
 _SET_BACK_NS = 1_000_000_000
 
@@ -36,9 +40,10 @@ class FrameRate:
             single_ns = sorted(self._intervals_ns)[_SINGLE]
             least_ns, most_ns = single_ns / _RATIO, single_ns * _RATIO
             similar = [interval for interval in self._intervals_ns if least_ns < interval < most_ns]
-            self.period_ns = sum(similar) // len(similar)
+            period_ns = sum(similar) // len(similar)
+            self.period_ns = min(max(period_ns, _SHORTEST_NS), _LONGEST_NS)
 
 
 def period_of(fps: float) -> int:
     """Frame period; a rate that makes no sense counts as 30 Hz."""
-    return round(1e9 / fps) if 0.01 < fps < 1000 else 33_333_333
+    return round(1e9 / fps) if MIN_FPS <= fps <= MAX_FPS else 33_333_333

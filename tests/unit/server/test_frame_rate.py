@@ -46,3 +46,8 @@ def test_a_clock_that_was_set_back_starts_the_measurement_anew() -> None:
     rate = fed(FrameRate(30.0), [10**13 + PERIOD_NS * k for k in range(20)])
     fed(rate, [2 * PERIOD_NS * k for k in range(10)])
     assert rate.period_ns == 2 * PERIOD_NS
+
+
+def test_no_stamps_make_a_camera_faster_or_slower_than_a_hello_may_say() -> None:
+    assert fed(FrameRate(30.0), list(range(20))).period_ns == period_of(240.0)
+    assert fed(FrameRate(30.0), [3600 * 10**9 * k for k in range(20)]).period_ns == period_of(0.1)
