@@ -3,7 +3,7 @@
 Marked on a circle one period round, the exposures of free-running cameras leave gaps; the tightest set
 starts after the widest gap. The next exposure of each camera (its head: a frame that waits, or one that is
 expected) is a candidate; where starting a frame later for the earliest cameras would be tighter by more
-than the hysteresis, the cut moves there. That is also how a set follows a camera that slides by a frame, at
+than that costs, the cut moves there. That is also how a set follows a camera that slides by a frame, at
 the price of one frame of that camera, and why a slow camera is not waited for while none of its is due.
 """
 
@@ -13,8 +13,8 @@ from rig_protocol.frames import RgbdFrame, mean_time_ns
 from rig_server.camera_queue import CameraQueue, Head
 from rig_server.rig_queues import RigQueues
 
-# A move of the cut costs frames. In the first sets after a camera joined it is worth this gain of spread,
-# in periods (above the jitter of software time stamps), and once in so many sets later on ...
+# A move of the cut costs frames. In the first sets after a camera joined or left it is worth this gain of
+# spread, in periods (above the jitter of software time stamps), and once in so many sets later on ...
 _SMALL_GAIN = 0.05
 _SETTLING_SETS = 30
 _SETTLED_SETS = 1500
