@@ -17,7 +17,7 @@ MAX_OUTSTANDING = 16
 SYSTEM_CLOCK_LIFE_NS = 5_000_000_000
 
 _STEP_UNCERTAINTIES = 4
-_STEP_MARGIN_NS = 100_000
+_STEP_MARGIN_NS = 200_000
 
 
 @dataclass(frozen=True, slots=True)
@@ -153,11 +153,16 @@ class ClockSync:
     def _contradicts(self, agent_ns: int, offset_ns: int, delay_ns: int) -> bool:
         """True when estimate and sample cannot both be right: a clock jumped.
 
-        The path's asymmetry is in both, so that only the difference of the delays is doubtful.
+        The path's asymmetry is in both, so that only what delays exceed the least one is doubtful. It takes
+        some samples to know that.
         """
         if self._line is None:
             return False
         expected_ns, uncertainty_ns = self._line.at(agent_ns)
-        doubt_ns = (abs(delay_ns - self._filter.least_delay_ns) + self._line.unseen_ns) / 2
+        least_ns = self._filter.least_delay_ns
+        if len(self._filter) < FAST_REQUESTS:
+            doubt_ns = (abs(delay_ns - least_ns) + least_ns) / 2
+        else:
+            doubt_ns = (abs(delay_ns - least_ns) + self._line.unseen_ns) / 2
         allowed_ns = doubt_ns + _STEP_UNCERTAINTIES * uncertainty_ns + _STEP_MARGIN_NS
         return abs(offset_ns - expected_ns) > allowed_ns
