@@ -23,9 +23,7 @@ class FrameDelays:
 
     def delay_ns(self, true_ns: float, random_source: random.Random) -> int:
         """Delay of a frame that the device finished at a true time."""
-        on_bus_ns = (
-            -true_ns % self.transfer_ns if self.beats else random_source.uniform(0, self.transfer_ns)
-        )
+        on_bus_ns = -true_ns % self.transfer_ns if self.beats else random_source.uniform(0, self.transfer_ns)
         host_ns = random_source.expovariate(1 / self.host_ns) if self.host_ns else 0
         spike_ns = self.spike_ns * random_source.random() if random_source.random() < self.spikes else 0
         return self.least_ns + round(on_bus_ns + host_ns + spike_ns)

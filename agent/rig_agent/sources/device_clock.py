@@ -11,14 +11,20 @@ _WRAP = 1 << 32  # ticks are a uint32: 71.58 s
 _BLOCK_NS = 1_000_000_000
 # A minute shows the rate to a few ppm, and a crystal's own wander in that time is small.
 _BLOCKS = 60
+# The slope of so few seconds is as doubtful as the drift of any two crystals.
+_SLOPE_SPAN_S = 2.0
 # One isochronous transfer holds 16 microframes of 125 µs: a frame arrives up to this late, evenly spread.
 _TRANSFER_NS = 2_000_000
+# A device at exactly 30 Hz meets the bus' grid of transfers in three phases only; where the crystals agree to
+# a few ppm, the least of them stays for minutes, and cannot be told from none: it is anything up to a third
+# of a transfer, evenly.
+_PHASE_NS = _TRANSFER_NS / 3 / math.sqrt(12)
 _DRIFT = 200e-6  # quartz clocks are off by less than 100 ppm each
 # libfreenect holds 32 ms of packets: what is later than this thrice running is no queue, the device's
 # clock fell back or this machine slept.
 _LATE_NS = 100_000_000
 _LATE_FRAMES = 3
-_EXCESS_FRAMES = 30  # over which the usual delay is averaged
+_FRAMES_A_BLOCK = 30
 
 
 def tick_difference(later: int, earlier: int) -> int:
@@ -41,20 +47,22 @@ class _Envelope:
     only add, and however long one is, it moves nothing. Of each second only the least lag is kept.
     """
 
-    def __init__(self, first: _Lag) -> None:
-        self.frames = 1
+    def __init__(self, first: _Lag, slope: float) -> None:
+        """The slope is the best guess so far, and counts while the seconds are few."""
+        self.slope, self._first_slope = slope, slope
+        self._frames = 1
         self._scatter_ns = 0.0  # of the seconds' least lags above the line
         self._least: deque[_Lag] = deque([first], maxlen=_BLOCKS)
         self._block = first.device_ns // _BLOCK_NS
-        self._anchor, self._slope = first, 0.0
+        self._anchor = first
 
     def at(self, device_ns: int) -> int:
         """Least lag at a device time."""
-        return self._anchor.lag_ns + round(self._slope * (device_ns - self._anchor.device_ns))
+        return self._anchor.lag_ns + round(self.slope * (device_ns - self._anchor.device_ns))
 
     def add(self, lag: _Lag) -> None:
         """Take a frame's lag."""
-        self.frames += 1
+        self._frames += 1
         block = lag.device_ns // _BLOCK_NS
         if block != self._block:
             self._block = block
@@ -67,20 +75,30 @@ class _Envelope:
         if lag.lag_ns < self.at(lag.device_ns):
             self._fit()
 
-    def doubt_ns(self, device_ns: int) -> float:
-        """How far the line may be off: the seconds scatter about it, and its slope is known by that."""
+    def doubt_ns(self, device_ns: int, range_ns: float) -> float:
+        """Standard uncertainty of the line at a device time, where delays spread over this range.
+
+        A second's least lag is expected range / (n + 1) above the line. The line is known by as many
+        seconds as it has, and at worst as they scatter about it; its slope by that over their span.
+        """
+        seconds = len(self._least)
+        height_ns = range_ns / (min(self._frames, _FRAMES_A_BLOCK) + 1)
+        value_ns = math.hypot(2 * height_ns / math.sqrt(seconds), self._scatter_ns)
         span_ns = self._least[-1].device_ns - self._least[0].device_ns
-        slope_doubt = min(_DRIFT, 2 * self._scatter_ns / span_ns) if span_ns >= _BLOCK_NS else _DRIFT
-        return self._scatter_ns + slope_doubt * (device_ns - self._least[-1].device_ns)
+        slope = min(_DRIFT, 2 * value_ns / span_ns) if span_ns >= _BLOCK_NS else _DRIFT
+        return value_ns + slope * (device_ns - self._least[-1].device_ns)
 
     def _fit(self) -> None:
         points = self._least
-        slope = max(-_DRIFT, min(_DRIFT, _slope_below(points)))
+        span_s = (points[-1].device_ns - points[0].device_ns) / 1e9
+        seen = max(-_DRIFT, min(_DRIFT, _slope_below(points)))
+        slope = self._first_slope + (seen - self._first_slope) * span_s**2 / (span_s**2 + _SLOPE_SPAN_S**2)
         origin_ns = points[-1].device_ns
         heights = [point.lag_ns - slope * (point.device_ns - origin_ns) for point in points]
         lowest = min(range(len(points)), key=heights.__getitem__)
-        self._anchor, self._slope = points[lowest], slope
-        self._scatter_ns = sum(heights) / len(heights) - heights[lowest]
+        self._anchor, self.slope = points[lowest], slope
+        # The median, because a second in which the host stood still says nothing of the others.
+        self._scatter_ns = sorted(heights)[len(heights) // 2] - heights[lowest]
 
 
 class DeviceClock:
@@ -106,13 +124,13 @@ class DeviceClock:
         lag = _Lag(device_ns, arrival_ns - device_ns)
         envelope = self._envelope
         if envelope is None or went_back or self._jumped(envelope, lag, arrival_ns):
-            envelope = self._envelope = _Envelope(lag)
+            envelope = self._envelope = _Envelope(lag, envelope.slope if envelope else 0.0)
             self._late_frames = 0
         else:
             envelope.add(lag)
-        stamp_ns = device_ns + envelope.at(device_ns)
+        stamp_ns = min(device_ns + envelope.at(device_ns), arrival_ns)
         excess_ns = arrival_ns - stamp_ns
-        self._excess_ns += (min(excess_ns, _LATE_NS) - self._excess_ns) / _EXCESS_FRAMES
+        self._excess_ns += (min(excess_ns, _LATE_NS) - self._excess_ns) / _FRAMES_A_BLOCK
         rising_ns = max(stamp_ns, self._last_stamp_ns + 1) if self._last_arrival_ns else stamp_ns
         self._last_arrival_ns, self._last_stamp_ns = arrival_ns, rising_ns
         return rising_ns, self._uncertainty(envelope, device_ns, excess_ns) + rising_ns - stamp_ns
@@ -139,10 +157,9 @@ class DeviceClock:
         )
 
     def _uncertainty(self, envelope: _Envelope, device_ns: int, excess_ns: int) -> int:
-        # The least of n evenly spread delays is expected at 1/(n+1) of their range, twice their mean.
         range_ns = max(_TRANSFER_NS, 2 * self._excess_ns)
         late_ns = excess_ns if excess_ns > _LATE_NS else 0
-        return math.ceil(range_ns / (envelope.frames + 1) + envelope.doubt_ns(device_ns)) + late_ns
+        return math.ceil(math.hypot(envelope.doubt_ns(device_ns, range_ns), _PHASE_NS)) + late_ns
 
 
 def _slope_below(points: Sequence[_Lag]) -> float:
