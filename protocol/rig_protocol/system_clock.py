@@ -53,7 +53,8 @@ class SystemClock:
     chrony and ntpd state a standard deviation (`esterror`) and a bound (`maxerror`, with half the root
     delay: the asymmetry of the way to the source). The first alone is too good, and the second grows by
     500 ppm until the next update. So the bound counts as it was stated at the latest update that was seen.
-    A stated error of zero (systemd-timesyncd) is no measurement, and counts as unknown.
+    A stated error of zero (systemd-timesyncd) is no measurement, and counts as unknown. chrony tells the
+    kernel that the clock is synchronised only where its configuration says `rtcsync`.
     """
 
     def __init__(
