@@ -48,6 +48,9 @@ __all__ = ["HEARTBEAT_INTERVAL_NS", "HELLO_RETRY_NS", "REFUSED_RETRY_NS", "SILEN
 # A server that is starting is met within a second; one that refuses needs a person first.
 HELLO_RETRY_NS = (100_000_000, 1_000_000_000)
 REFUSED_RETRY_NS = (500_000_000, 5_000_000_000)
+# A live server asks for the time every 250 ms: when two requests are lost in a row, and a notice says that
+# it does not know us, it may be true.
+DOUBT_NS = 600_000_000
 # Events come at the pace of hellos: an owner that never fetches loses the oldest.
 _MAX_EVENTS = 64
 
@@ -205,7 +208,7 @@ class AgentLink:
         if session is None or prefix.id != session.welcome.session_id:
             return "unknown_session"
         if prefix.type == MessageType.UNKNOWN_SESSION:
-            return self._receive_notice(data, now_ns)
+            return self._receive_notice(session, data, now_ns)
         body = session.open(data, now_ns)
         return body if isinstance(body, str) else self._receive_body(session, prefix.type, body, now_ns)
 
@@ -225,15 +228,16 @@ class AgentLink:
             return "malformed"
         return None
 
-    def _receive_notice(self, data: Buffer, now_ns: int) -> str | None:
+    def _receive_notice(self, session: AgentSession, data: Buffer, now_ns: int) -> str | None:
         """The server does not know our session, or somebody says so in its name: find out by a new hello.
 
-        The session goes on until a welcome replaces it, or the server's silence ends it.
+        A server that is there is heard before the hello is due, which is then not sent. The session goes on
+        until a welcome replaces it, or the server's silence ends it.
         """
         if len(data) != PREFIX_SIZE:
             return "malformed"
         if self._handshake is None:
-            self._say_hello(now_ns)
+            self._say_hello(max(now_ns, session.heard_ns + DOUBT_NS) if session.confirmed else now_ns)
         return None
 
     def _receive_body(self, session: AgentSession, message_type: int, body: bytes, now_ns: int) -> str | None:
@@ -260,9 +264,9 @@ class AgentLink:
         self._session, self.plan = None, None
         self._say_hello(now_ns)
 
-    def _say_hello(self, now_ns: int) -> None:
+    def _say_hello(self, due_ns: int) -> None:
         self._handshake = AgentHandshake(self._hello, self._rig_key, self._random_bytes)
-        self._hello_due_ns = now_ns
+        self._hello_due_ns = due_ns
         self._hello_retry_ns = HELLO_RETRY_NS[0]
 
     def _begin(self, session: AgentSession) -> None:

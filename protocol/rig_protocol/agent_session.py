@@ -20,8 +20,6 @@ CONFIRM_INTERVAL_NS = 50_000_000
 SILENCE_NS = 2_000_000_000
 # The server sends eight requests in a row; each is answered at the next turn of the shell.
 _MAX_CLOCK_REQUESTS = 16
-# Frames that a pacer holds: the one that is being sent and the next.
-_MAX_UNSENT = 2
 # Four rounds of requests for every frame that is still held.
 _MAX_RESENDS = 32
 
@@ -41,6 +39,7 @@ class AgentSession:
         self._seal = FrameSeal(self.welcome.cipher, keys)
         self._heartbeat_due_ns = now_ns
         self._frame_number = 0
+        self._sent_frames = 0  # all below this number have left, as of the latest `answer_resends`
         self._clock_requests: deque[tuple[ClockRequest, int]] = deque(maxlen=_MAX_CLOCK_REQUESTS)
         self._resends: deque[Resend] = deque(maxlen=_MAX_RESENDS)
 
@@ -85,8 +84,7 @@ class AgentSession:
         if is_due(self._heartbeat_due_ns, now_ns, HEARTBEAT_INTERVAL_NS):
             interval_ns = HEARTBEAT_INTERVAL_NS if self.confirmed else CONFIRM_INTERVAL_NS
             self._heartbeat_due_ns = now_ns + interval_ns
-            sent = max(0, self._frame_number - _MAX_UNSENT)
-            datagrams.append(self.seal(Heartbeat(health, sent)))
+            datagrams.append(self.seal(Heartbeat(health, self._sent_frames)))
         return datagrams
 
     def cut(self, frame: EncodedFrame, datagram_size: int) -> DatagramBatch:
@@ -99,6 +97,8 @@ class AgentSession:
 
     def answer_resends(self, sent_of: Callable[[DatagramBatch], int]) -> tuple[list[DatagramBatch], int]:
         """What to send again now, and how many fragments were refused."""
+        unsent = self.history.first_unsent(sent_of)
+        self._sent_frames = self._frame_number if unsent is None else unsent
         batches: list[DatagramBatch] = []
         refused = self.history.refused
         while self._resends:

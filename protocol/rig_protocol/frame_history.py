@@ -1,6 +1,7 @@
 """The agent's memory of what it sent, for the server to ask again, within a budget."""
 
 from collections import deque
+from collections.abc import Callable
 
 from rig_protocol.datagram import DatagramBatch
 from rig_protocol.messages import Resend
@@ -37,6 +38,10 @@ class FrameHistory:
     def find(self, frame_number: int) -> DatagramBatch | None:
         """A frame that is still held."""
         return next((batch for number, batch in self._frames if number == frame_number), None)
+
+    def first_unsent(self, sent_of: Callable[[DatagramBatch], int]) -> int | None:
+        """The oldest frame that has not left whole; None when all have."""
+        return next((number for number, batch in self._frames if sent_of(batch) < len(batch)), None)
 
     def answer(self, resend: Resend, sent: int) -> list[DatagramBatch]:
         """What to send again of a frame of which the first `sent` datagrams have been sent at all."""

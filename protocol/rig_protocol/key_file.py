@@ -1,5 +1,6 @@
 """The file that holds the rig's key: written readable by its owner alone, refused when others can read it."""
 
+import contextlib
 import logging
 import os
 import stat
@@ -75,5 +76,6 @@ def write_key(path: Path, key: RigKey, force: bool = False) -> None:
             os.fsync(file.fileno())
         fresh.replace(path)
     except OSError as error:
-        fresh.unlink(missing_ok=True)
+        with contextlib.suppress(OSError):  # where nothing can be written, nothing can be removed either
+            fresh.unlink()
         raise ConfigurationError(f"{path} cannot be written: {error.strerror}") from error

@@ -29,19 +29,20 @@ class PendingSession:
 
 
 class PendingSessions:
-    """By session id and by nonce; the oldest gives way. Remembers the nonces that became sessions."""
+    """By session id, and by nonce and address; the oldest gives way. Remembers the nonces of sessions."""
 
     def __init__(self) -> None:
         self._by_id: OrderedDict[int, PendingSession] = OrderedDict()
-        self._ids: dict[int, int] = {}  # by nonce
+        # An agent whose socket was opened anew says the same hello from another port.
+        self._ids: dict[tuple[int, Address], int] = {}
         self._used: OrderedDict[int, None] = OrderedDict()
 
     def __contains__(self, session_id: int) -> bool:
         return session_id in self._by_id
 
-    def of_nonce(self, nonce: int) -> PendingSession | None:
-        """The handshake that this very hello began."""
-        session_id = self._ids.get(nonce)
+    def of_hello(self, nonce: int, address: Address) -> PendingSession | None:
+        """The handshake that this very hello from there began."""
+        session_id = self._ids.get((nonce, address))
         return None if session_id is None else self._by_id[session_id]
 
     def of_id(self, session_id: int) -> PendingSession | None:
@@ -56,15 +57,15 @@ class PendingSessions:
         """Wait for the agent's first sealed message."""
         session_id = pending.agreement.welcome.session_id
         self._by_id[session_id] = pending
-        self._ids[pending.nonce] = session_id
+        self._ids[pending.nonce, pending.address] = session_id
         if len(self._by_id) > MAX_PENDING:
             _, oldest = self._by_id.popitem(last=False)
-            del self._ids[oldest.nonce]
+            del self._ids[oldest.nonce, oldest.address]
 
     def take(self, session_id: int) -> None:
         """The session begins: its hello is used."""
         pending = self._by_id.pop(session_id)
-        del self._ids[pending.nonce]
+        del self._ids[pending.nonce, pending.address]
         self._used[pending.nonce] = None
         if len(self._used) > MAX_USED_NONCES:
             self._used.popitem(last=False)

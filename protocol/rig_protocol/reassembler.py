@@ -32,7 +32,7 @@ NUMBER_WINDOW = 32
 GRACE_NS = 200_000_000
 
 # A verified number moves the window; until one comes, losses are remembered for as many frames: 34 s.
-_MAX_FATES = 1024
+_MAX_GIVEN_UP = 1024
 # Late fragments follow soon after their unit was given up.
 _MAX_LOST_KEYS = 64
 _MAX_FRAGMENTS = 2**16
@@ -76,7 +76,10 @@ class Reassembler:
         self._spare: list[bytearray] = []
         self._lost_keys: dict[_UnitKey, None] = {}  # oldest first
         self._window_start = 0
-        self._fates: dict[int, bool] = {}  # by frame number, from the window's start: True = delivered
+        # Frame numbers from the window's start on. Apart, so that no flood of forged headers, each of them
+        # given up, makes us forget what was delivered and take it again.
+        self._delivered: set[int] = set()
+        self._given_up: dict[int, None] = {}  # oldest first
         self._unseen: dict[int, _Unseen] = {}  # by frame number, within the window
         self._next_number = 0  # the highest number heard of, and one
         self._sure_number = 0  # the same, of what is authentic
@@ -164,7 +167,10 @@ class Reassembler:
 
     def _miss_before(self, number: int, now_ns: int) -> None:
         """All frames below `number` were sent: what has not come of them is missed."""
+        begun = {key.frame_number for key in self._open}
         for unseen in range(max(self._next_number, number - NUMBER_WINDOW), number):
+            if unseen in begun or unseen in self._given_up:  # its number came far ahead, and was not believed
+                continue
             deadline_ns = now_ns + self._interval_ns + GRACE_NS
             self._unseen[unseen] = _Unseen(now_ns + REORDER_NS, deadline_ns)
             self._wake_at(now_ns + REORDER_NS)
@@ -196,7 +202,7 @@ class Reassembler:
         counters, number = self._counters, key.frame_number
         if number < self._window_start or key in self._lost_keys:
             counters.late += count
-        elif self._fates.get(number):
+        elif number in self._delivered:
             counters.duplicate += count
         elif key.unit_size > MAX_SEALED_SIZE:
             counters.oversized += count
@@ -232,7 +238,8 @@ class Reassembler:
         # What a bit error made of a header of this frame goes with it.
         for other in [k for k in self._open if k.frame_number == key.frame_number]:
             self._recycle(self._open.pop(other))
-        self._fates[key.frame_number] = True
+        self._given_up.pop(key.frame_number, None)
+        self._delivered.add(key.frame_number)
         self._sure_number = max(self._sure_number, key.frame_number + 1)
         self._next_number = max(self._next_number, self._sure_number)
         self._move_window(key.frame_number - NUMBER_WINDOW + 1)
@@ -256,16 +263,18 @@ class Reassembler:
             self._give_up(key)
 
     def _move_window(self, start: int) -> None:
-        """Close the numbers below `start`; those without a fate were never seen."""
+        """Close the numbers below `start`; those neither delivered nor given up were never seen."""
         if start <= self._window_start:
             return
         for key in [k for k in self._open if k.frame_number < start]:
             self._counters.incomplete += 1
             self._give_up(key)
-        known = [number for number in self._fates if number < start]
-        self._counters.missing += start - self._window_start - len(known)
-        for number in known:
-            del self._fates[number]
+        delivered = {number for number in self._delivered if number < start}
+        given_up = [number for number in self._given_up if number < start]
+        self._counters.missing += start - self._window_start - len(delivered) - len(given_up)
+        self._delivered -= delivered
+        for number in given_up:
+            del self._given_up[number]
         for number in [number for number in self._unseen if number < start]:
             del self._unseen[number]
         self._window_start = start
@@ -276,9 +285,10 @@ class Reassembler:
         self._lost_keys[key] = None
         if len(self._lost_keys) > _MAX_LOST_KEYS:
             del self._lost_keys[next(iter(self._lost_keys))]
-        self._fates.setdefault(key.frame_number, False)
-        if len(self._fates) > _MAX_FATES:
-            del self._fates[next(iter(self._fates))]
+        if key.frame_number not in self._delivered:
+            self._given_up[key.frame_number] = None
+        if len(self._given_up) > _MAX_GIVEN_UP:
+            del self._given_up[next(iter(self._given_up))]
 
     # ---- buffers
 
@@ -287,7 +297,7 @@ class Reassembler:
         for k, spare in enumerate(self._spare):
             if size <= len(spare):
                 return self._spare.pop(k)
-        return bytearray(size + size // 8)
+        return bytearray(min(size + size // 8, MAX_SEALED_SIZE))
 
     def _recycle(self, unit: OpenUnit) -> None:
         if len(self._spare) == _MAX_SPARE:

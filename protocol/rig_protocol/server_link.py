@@ -57,7 +57,7 @@ from rig_protocol.messages import (
     Welcome,
 )
 from rig_protocol.pending_sessions import PendingSession, PendingSessions
-from rig_protocol.rate_limit import RateLimit, TokenBucket
+from rig_protocol.rate_limit import RateLimit
 from rig_protocol.rig_key import RigKey
 from rig_protocol.roster import Roster
 from rig_protocol.sealed_channel import SealedChannel
@@ -69,9 +69,10 @@ _NOTICE_INTERVAL_NS = 100_000_000  # to one address
 _NOTICE_INTERVAL_ALL_NS = 5_000_000
 # A rig clock that reads so much less than before has been set back: no time of a session means anything.
 _BACKWARD_STEP_NS = 1_000_000_000
-# A key agreement costs 0.1 ms: 100 a second are 1 % of a core. Whole rigs join at once.
+# A key agreement costs 0.1 ms: so many a second are 1 % of a core.
 _HANDSHAKE_INTERVAL_NS = 10_000_000
-_HANDSHAKES_AT_ONCE = 64
+# Agents that lost their server in the same moment ask for it in step: all of them are to be answered at once.
+_HANDSHAKE_BURST = 64
 _REFUSAL_EVENT_INTERVAL_NS = 1_000_000_000
 # Answers wait for one turn of the shell; a flood of hellos beyond this loses its oldest answers.
 _MAX_OUTGOING = 1024
@@ -114,7 +115,7 @@ class ServerLink:
         self._outgoing: deque[tuple[bytes, Address]] = deque(maxlen=_MAX_OUTGOING)
         self._notices = RateLimit(_NOTICE_INTERVAL_NS)
         self._all_notices = RateLimit(_NOTICE_INTERVAL_ALL_NS, max_keys=1)
-        self._handshakes = TokenBucket(_HANDSHAKE_INTERVAL_NS, _HANDSHAKES_AT_ONCE)
+        self._handshakes = RateLimit(_HANDSHAKE_INTERVAL_NS, max_keys=1, burst=_HANDSHAKE_BURST)
         self._refusal_events = RateLimit(_REFUSAL_EVENT_INTERVAL_NS)
 
     @property
@@ -168,10 +169,13 @@ class ServerLink:
         self._due_ns = min((session.due_ns for session in self._sessions.values()), default=None)
 
     def plan_stream(self, camera_id: int, choice: StreamChoice) -> None:
-        """What a connected camera is to send from now on; told with its next clock request."""
+        """What a connected camera is to send from now on; told with its next clock request.
+
+        LinkUsageError for a choice that no plan can tell.
+        """
         session = self._holder(camera_id)
         if session is not None:
-            session.choice = choice
+            session.choose(choice)
 
     def next_event(self) -> ServerEvent | None:
         """The oldest event that was not fetched yet, or None."""
@@ -298,9 +302,12 @@ class ServerLink:
 
     def _take_hello(self, prefix: Prefix, datagram: Buffer, address: Address, now_ns: int) -> Reject | None:
         """Answer a hello, or say why not. Nothing but a bounded table changes before the agent confirms."""
-        known = self._pending.of_nonce(prefix.id)
-        if known is not None or self._pending.was_used(prefix.id):
-            self._answer_copy(known, address)
+        if self._pending.was_used(prefix.id):
+            self.rejected["stale_hello"] += 1  # a copy of an old one
+            return None
+        known = self._pending.of_hello(prefix.id, address)
+        if known is not None:
+            self._outgoing.append((known.welcome_datagram, address))  # our answer was lost
             return None
         try:
             hello = open_hello(datagram, prefix.id, self._rig_key)
@@ -311,7 +318,7 @@ class ServerLink:
         welcome = self._choose(hello, address, now_ns)
         if isinstance(welcome, Reject):
             return welcome
-        if self._handshakes.allows(now_ns):
+        if self._handshakes.allows("all", now_ns):
             self._answer_hello(prefix.id, datagram, hello, welcome, address)
         else:  # the agent tries again in a moment
             self.rejected["handshake_limit"] += 1
@@ -339,13 +346,6 @@ class ServerLink:
             return
         self._pending.add(PendingSession(hello, nonce, address, agreement, answer))
         self._outgoing.append((answer, address))
-
-    def _answer_copy(self, known: PendingSession | None, address: Address) -> None:
-        """A hello came again: our answer to it was lost, or it is a copy of an old one."""
-        if known is not None and known.address == address:
-            self._outgoing.append((known.welcome_datagram, address))
-        else:
-            self.rejected["stale_hello"] += 1
 
     def _confirm(self, prefix: Prefix, datagram: Buffer, address: Address, now_ns: int) -> None:
         """The first sealed message of a session proves that its agent is there: the session begins."""

@@ -7,6 +7,7 @@ from math import ceil, hypot
 from rig_protocol.clock_sync import ClockEstimate, ClockSync
 from rig_protocol.counters import CameraCounters
 from rig_protocol.datagram import Buffer, FragmentHeader
+from rig_protocol.errors import LinkUsageError
 from rig_protocol.events import Address
 from rig_protocol.frames import EncodedFrame
 from rig_protocol.handshake import Agreement
@@ -57,7 +58,7 @@ class ServerSession:
         self.address = status.address  # a session is bound to it; the status may move on
         self.welcome = welcome
         self.last_heard_ns = now_ns
-        self.choice: StreamChoice | None = None
+        self._choice: StreamChoice | None = None
         self._channel = SealedChannel(
             welcome.cipher, keys.server_control, keys.agent_control, welcome.session_id
         )
@@ -87,6 +88,15 @@ class ServerSession:
             counters = self.status.counters
             setattr(counters, body, getattr(counters, body) + 1)
         return body
+
+    def choose(self, choice: StreamChoice) -> None:
+        """What the agent is to send from now on; LinkUsageError where no plan can tell it."""
+        if not (0 <= choice.slot < choice.slots and choice.step_ns > 0):
+            raise LinkUsageError(
+                f"slot {choice.slot} of {choice.slots} in a step of {choice.step_ns} ns: there is none"
+            )
+        encode_body(_plan(choice, offset_ns=0))  # raises where it cannot be sent
+        self._choice = choice
 
     def seal(self, message: Message) -> bytes:
         """The datagram of a message to this agent."""
@@ -118,8 +128,10 @@ class ServerSession:
         """The clock request, stamped now, and the stream plan with it, where they are due."""
         if self._clock.next_request_ns > now_ns:
             return []
-        plan = self._plan()
-        messages: list[Message] = [self._clock.request(now_ns), *([] if plan is None else [plan])]
+        messages: list[Message] = [self._clock.request(now_ns)]
+        clock = self._clock.estimate
+        if self._choice is not None and clock is not None:
+            messages.append(_plan(self._choice, clock.offset_ns))
         return [self.seal(message) for message in messages]
 
     def silent(self, now_ns: int) -> bool:
@@ -138,21 +150,6 @@ class ServerSession:
         """The session is over: count what it leaves unfinished."""
         self._reassembler.close()
         self.status.connected = False
-
-    def _plan(self) -> StreamPlan | None:
-        """The choice, and the rig clock; None without a choice or before the agent's clock is known."""
-        choice, clock = self.choice, self._clock.estimate
-        if choice is None or clock is None:
-            return None
-        return StreamPlan(
-            color_codec=choice.color_codec,
-            depth_codec=choice.depth_codec,
-            fps=choice.fps,
-            step_ns=choice.step_ns,
-            phase_ns=choice.phase_ns,
-            spread=choice.spread,
-            offset_ns=clock.offset_ns,
-        )
 
     def _accept(self, frame: EncodedFrame, now_ns: int) -> EncodedFrame | None:
         counters = self.status.counters
@@ -180,3 +177,16 @@ class ServerSession:
             return None
         total_ns = ceil(hypot(uncertainty_ns, frame.uncertainty_ns))
         return replace(frame, timestamp_ns=timestamp_ns, uncertainty_ns=total_ns, received_ns=now_ns)
+
+
+def _plan(choice: StreamChoice, offset_ns: int) -> StreamPlan:
+    """A choice for an agent whose time plus `offset_ns` is rig time."""
+    return StreamPlan(
+        color_codec=choice.color_codec,
+        depth_codec=choice.depth_codec,
+        fps=choice.fps,
+        step_ns=choice.step_ns,
+        phase_ns=choice.phase_ns,
+        spread=choice.spread,
+        offset_ns=offset_ns,
+    )

@@ -12,6 +12,7 @@ from rig_protocol.frames import EncodedFrame, Payload
 from rig_protocol.messages import Hello
 from rig_protocol.rig_key import RigKey
 from rig_protocol.roster import Roster
+from rig_protocol.security import Cipher, FrameSeal, SessionKeys
 from rig_protocol.server_link import ServerLink
 
 COLOR, DEPTH = 2, 5
@@ -56,6 +57,12 @@ def make_frame(sequence: int = 0, timestamp_ns: int = T0, size: int = 4000, **ch
 def random_bytes(seed: int) -> Callable[[int], bytes]:
     """A seeded source of bytes."""
     return random.Random(seed).randbytes
+
+
+def make_seal(seed: int = 1, cipher: Cipher = Cipher.CHACHA20_POLY1305) -> FrameSeal:
+    """The seal of a session's frames."""
+    source = random_bytes(seed)
+    return FrameSeal(cipher, SessionKeys(*(source(32) for _ in range(4))))
 
 
 def make_server(roster: Roster | None = None, seed: int = 1, **changes: Any) -> ServerLink:

@@ -25,6 +25,7 @@ from rig_protocol.errors import DataError
 from rig_protocol.events import CameraJoined, CameraLeft, FrameReceived
 from rig_protocol.frames import RgbdFrame
 from rig_protocol.rig_folder import CameraEntry, RigDescription, write_rig_folder
+from rig_protocol.rig_key import RigKey
 from rig_protocol.roster import Roster, Slot
 from support.loopback_server import LoopbackServer
 
@@ -77,7 +78,7 @@ def make_settings(server: LoopbackServer, **changes: object) -> AgentSettings:
 @contextmanager
 def running(settings: AgentSettings, open_source: Callable[[], FrameSource]) -> Iterator[Agent]:
     """An agent whose `run` is on a thread; stopped at the end."""
-    agent = Agent(settings, open_source)
+    agent = Agent(settings, RigKey.INSECURE, open_source)
     thread = threading.Thread(target=agent.run)
     thread.start()
     try:
@@ -209,7 +210,7 @@ def test_what_no_retry_cures_ends_the_agent_with_a_goodbye(server: LoopbackServe
         if next(reads) == 30:
             raise DataError("color_003.png is torn")
 
-    agent = Agent(make_settings(server), lambda: FakeSource(trouble=break_later))
+    agent = Agent(make_settings(server), RigKey.INSECURE, lambda: FakeSource(trouble=break_later))
     with pytest.raises(DataError, match=r"color_003.png is torn"):
         agent.run()
     assert "goodbye" in server.wait_for(CameraLeft).text
@@ -236,7 +237,7 @@ def test_a_signal_ends_the_program_with_a_goodbye_and_status_0(
     image = np.zeros((48, 64), np.uint8)
     frame = RgbdFrame(3, 0, 0, color=image, raw=image.astype(np.uint16))
     write_rig_folder(tmp_path, RigDescription((CameraEntry(3, "cam03", model),)), [frame])
-    words = ["--source", "folder", "--path", str(tmp_path), "--camera", "3"]
+    words = ["--source", "folder", "--path", str(tmp_path), "--camera", "3", "--insecure"]
     program = subprocess.Popen(
         [sys.executable, "-m", "rig_agent.cli", *words, "--server", f"127.0.0.1:{server.address[1]}"],
         stderr=subprocess.PIPE,

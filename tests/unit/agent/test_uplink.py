@@ -11,6 +11,7 @@ from rig_agent.uplink import Uplink
 from rig_protocol.camera import CameraModel
 from rig_protocol.datagram import DatagramBatch
 from rig_protocol.frames import EncodedFrame
+from rig_protocol.rig_key import RigKey
 
 SECOND_NS = 1_000_000_000
 SETTINGS = AgentSettings(camera=0)
@@ -63,7 +64,7 @@ def serve_until(uplink: Uplink, end_ns: int) -> None:
 
 
 def test_nothing_happens_before_the_introduction(transport: DeadTransport) -> None:
-    uplink = Uplink(SETTINGS)
+    uplink = Uplink(SETTINGS, RigKey.INSECURE)
     uplink.serve(0)
     assert uplink.next_timeout_ns() is None
     assert (transport.opened, transport.sent) == (0, [])
@@ -72,7 +73,7 @@ def test_nothing_happens_before_the_introduction(transport: DeadTransport) -> No
 def test_an_unreachable_server_hears_hellos_and_its_name_is_looked_up_every_five_seconds(
     transport: DeadTransport,
 ) -> None:
-    uplink = Uplink(SETTINGS)
+    uplink = Uplink(SETTINGS, RigKey.INSECURE)
     uplink.introduce(HELLO, 0)
     serve_until(uplink, 21 * SECOND_NS)
     assert transport.opened == 5
@@ -81,7 +82,7 @@ def test_an_unreachable_server_hears_hellos_and_its_name_is_looked_up_every_five
 
 def test_without_a_network_the_way_out_is_tried_every_second(transport: DeadTransport) -> None:
     transport.network = False
-    uplink = Uplink(SETTINGS)
+    uplink = Uplink(SETTINGS, RigKey.INSECURE)
     uplink.introduce(HELLO, 0)
     serve_until(uplink, 10 * SECOND_NS + 1)
     assert transport.opened == 11
@@ -89,14 +90,14 @@ def test_without_a_network_the_way_out_is_tried_every_second(transport: DeadTran
 
 @pytest.mark.usefixtures("transport")
 def test_frames_are_not_queued_while_nobody_listens() -> None:
-    uplink = Uplink(SETTINGS)
+    uplink = Uplink(SETTINGS, RigKey.INSECURE)
     uplink.introduce(HELLO, 0)
     uplink.send_frame(EncodedFrame(0, 0, 0), 0)
     assert (uplink.sent, uplink.dropped, uplink.unheard, uplink.welcome) == (0, 0, 1, None)
 
 
 def test_closing_without_a_session_is_silent(transport: DeadTransport) -> None:
-    uplink = Uplink(SETTINGS)
+    uplink = Uplink(SETTINGS, RigKey.INSECURE)
     uplink.introduce(HELLO, 0)
     uplink.close(0)
     assert transport.sent == []

@@ -47,4 +47,13 @@ def test_only_the_latest_keys_are_remembered() -> None:
     limit = RateLimit(100, max_keys=2)
     assert [limit.allows(key, 0) for key in "abca"] == [True, True, True, True]
     assert not limit.allows("c", 0)
-    assert len(limit._last_ns) == 2
+    assert len(limit._full_ns) == 2
+
+
+def test_what_was_saved_up_may_happen_at_once_and_then_one_an_interval() -> None:
+    limit = RateLimit(100, burst=3)
+    assert [limit.allows("a", now_ns) for now_ns in (0, 0, 0, 0, 99, 100, 150, 200, 299)] == [
+        *(True, True, True, False),
+        *(False, True, False, True, False),
+    ]
+    assert sum(limit.allows("a", 10_000) for _ in range(10)) == 3

@@ -8,7 +8,7 @@ from rig_protocol.datagram import DatagramBatch, FragmentHeader, consecutive_run
 from rig_protocol.errors import LinkUsageError
 
 HEADER = FragmentHeader(
-    frame_crc=0x11223344,
+    seal=0x11223344,
     session_id=0x0102030405060708,
     frame_number=0x0A,
     unit_size=0x00030405,
@@ -17,7 +17,7 @@ HEADER = FragmentHeader(
 )
 # The byte table of SPEC section 3, written out by hand.
 HEADER_BYTES = bytes.fromhex(
-    "4b52 01 10 44332211 0807060504030201 0a00000000000000 05040300 a005 0700".replace(" ", "")
+    "4b52 02 10 44332211 0807060504030201 0a00000000000000 05040300 a005 0700".replace(" ", "")
 )
 
 
@@ -37,7 +37,7 @@ def test_fragment_header_byte_layout() -> None:
 
 def test_the_structured_dtype_has_the_layout_of_the_header() -> None:
     record = np.frombuffer(HEADER_BYTES, datagram.FRAGMENT_HEADER)[0]
-    assert (record["magic"], record["version"], record["type"]) == (b"KR", 1, 16)
+    assert (record["magic"], record["version"], record["type"]) == (b"KR", 2, 16)
     assert [int(record[name]) for name in HEADER._fields] == list(HEADER)
 
 
@@ -57,7 +57,7 @@ def test_a_datagram_without_payload_or_with_size_zero_has_no_header() -> None:
 
 def test_a_prefix_needs_sixteen_bytes() -> None:
     assert datagram.parse_prefix(HEADER_BYTES[:15]) is None
-    assert datagram.parse_prefix(HEADER_BYTES[:16]) == (b"KR", 1, 16, 0x11223344, HEADER.session_id)
+    assert datagram.parse_prefix(HEADER_BYTES[:16]) == (b"KR", 2, 16, 0x11223344, HEADER.session_id)
 
 
 def test_a_batch_is_datagrams_of_one_size_and_a_shorter_last_one() -> None:

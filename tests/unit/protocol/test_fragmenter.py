@@ -9,14 +9,17 @@ from rig_protocol.fragmenter import fragment
 from rig_protocol.frame_unit import (
     FRAME_HEADER_SIZE,
     MAX_UNIT_SIZE,
-    frame_crc,
+    leading_seal,
     pack_unit,
     parse_unit,
+    sealed_place,
 )
 from rig_protocol.frames import EncodedFrame, Payload
-from support.wire import COLOR, DEPTH, make_frame
+from rig_protocol.security import TAG_SIZE
+from support.wire import COLOR, DEPTH, make_frame, make_seal
 
 SESSION = 0xABCDEF
+SEAL = make_seal()
 
 
 def test_frame_header_byte_layout() -> None:
@@ -84,46 +87,67 @@ def test_a_frame_over_the_limits_is_misuse(frame: EncodedFrame) -> None:
         pack_unit(frame)
 
 
-@pytest.mark.parametrize("size", [0, 1, 1408, 1409, 1440, 2848, 2849, 240_000])
+@pytest.mark.parametrize("size", [0, 1, 1392, 1393, 1440, 2832, 2833, 240_000])
 @pytest.mark.parametrize("datagram_size", [1200, 1472, 8972])
-def test_fragments_are_full_but_the_last_and_carry_the_unit_in_order(size: int, datagram_size: int) -> None:
+def test_fragments_are_full_but_the_last_and_carry_the_sealed_unit_in_order(
+    size: int, datagram_size: int
+) -> None:
     frame = make_frame(size=size)
-    batch = fragment(frame, SESSION, datagram_size, 9)
+    batch = fragment(frame, SESSION, 9, SEAL, datagram_size)
     sizes = [len(datagram) for datagram in batch]
     assert sizes[:-1] == [datagram_size] * (len(batch) - 1)
     assert FRAGMENT_HEADER_SIZE < sizes[-1] <= datagram_size
-    assert b"".join(bytes(datagram[FRAGMENT_HEADER_SIZE:]) for datagram in batch) == pack_unit(frame)
+    header = parse_fragment_header(batch[0])
+    assert header is not None
+    sealed = b"".join(bytes(datagram[FRAGMENT_HEADER_SIZE:]) for datagram in batch)
+    assert SEAL.open(9, sealed, sealed_place(header)) == pack_unit(frame)
+
+
+def test_no_payload_byte_travels_in_the_clear() -> None:
+    frame = make_frame(size=3000)
+    batch = bytes(fragment(frame, SESSION, 9, SEAL).buffer)
+    assert frame.color is not None
+    assert not any(bytes(frame.color.data[k : k + 8]) in batch for k in range(0, 1900, 8))
 
 
 def test_every_fragment_repeats_what_identifies_the_frame() -> None:
     frame = make_frame(size=5000)
-    headers = [parse_fragment_header(datagram) for datagram in fragment(frame, SESSION, 1472, 9)]
+    batch = fragment(frame, SESSION, 9, SEAL)
+    headers = [parse_fragment_header(datagram) for datagram in batch]
     first = headers[0]
     assert first is not None
-    assert (first.session_id, first.frame_number, first.unit_size) == (SESSION, 9, len(pack_unit(frame)))
-    assert first.frame_crc == frame_crc(pack_unit(frame), first)
+    sealed_size = len(pack_unit(frame)) + TAG_SIZE
+    assert (first.session_id, first.frame_number, first.unit_size) == (SESSION, 9, sealed_size)
+    sealed = b"".join(bytes(datagram[FRAGMENT_HEADER_SIZE:]) for datagram in batch)
+    assert first.seal == leading_seal(sealed)
     assert headers == [first._replace(fragment_index=k) for k in range(4)]
 
 
-def test_the_crc_binds_a_unit_to_session_number_and_layout() -> None:
-    unit = pack_unit(make_frame())
-    header = parse_fragment_header(fragment(make_frame(), SESSION)[0])
+def test_the_seal_binds_a_unit_to_session_number_and_layout() -> None:
+    batch = fragment(make_frame(size=1000), SESSION, 9, SEAL)
+    header = parse_fragment_header(batch[0])
     assert header is not None
+    sealed = bytes(batch[0][FRAGMENT_HEADER_SIZE:])
+    assert SEAL.open(9, sealed, sealed_place(header)) is not None
     for field in ("session_id", "frame_number", "unit_size", "payload_size"):
         moved = header._replace(**{field: getattr(header, field) + 1})
-        assert frame_crc(unit, moved) != frame_crc(unit, header)
+        assert SEAL.open(moved.frame_number, sealed, sealed_place(moved)) is None
 
 
-def test_a_frame_without_a_number_goes_out_under_its_sequence() -> None:
-    header = parse_fragment_header(fragment(make_frame(31), SESSION)[0])
-    assert header is not None
-    assert header.frame_number == 31
+def test_the_same_frame_under_two_numbers_or_keys_has_nothing_in_common() -> None:
+    frame = make_frame(size=1000)
+    one, other = (
+        bytes(fragment(frame, SESSION, number, SEAL)[0][FRAGMENT_HEADER_SIZE:]) for number in (1, 2)
+    )
+    foreign = bytes(fragment(frame, SESSION, 1, make_seal(5))[0][FRAGMENT_HEADER_SIZE:])
+    for sealed in (other, foreign):
+        assert not any(one[k : k + 8] == sealed[k : k + 8] for k in range(0, 1000, 8))
 
 
-@pytest.mark.parametrize("datagram_size", [0, 32, 63, 65508])
+@pytest.mark.parametrize("datagram_size", [0, 32, 63, 64, 65508])
 def test_a_datagram_size_that_cannot_carry_every_frame_is_misuse(datagram_size: int) -> None:
     with pytest.raises(LinkUsageError):
-        fragment(make_frame(), SESSION, datagram_size)
+        fragment(make_frame(), SESSION, 9, SEAL, datagram_size)
 
 
 def test_payloads_may_be_any_bytes_like_object() -> None:

@@ -1,22 +1,22 @@
 import math
-from collections.abc import Callable
 from typing import Any
 
 import msgpack
 import pytest
 
 from rig_protocol.camera import CameraModel, Intrinsics
-from rig_protocol.datagram import MessageType, pack_prefix, parse_prefix
+from rig_protocol.datagram import MessageType
 from rig_protocol.errors import DataError, LinkUsageError
 from rig_protocol.message_bytes import (
+    HELLO_OVERHEAD,
     MAX_CONTROL_SIZE,
+    MAX_RANGES,
     MIN_HELLO_SIZE,
-    control_crc,
-    decode_hello,
-    decode_message,
-    encode_message,
+    decode_body,
+    encode_body,
 )
 from rig_protocol.messages import (
+    WHOLE_FRAME,
     ClockReply,
     ClockRequest,
     Goodbye,
@@ -25,13 +25,17 @@ from rig_protocol.messages import (
     Message,
     Reject,
     RejectReason,
+    Resend,
+    StreamPlan,
     UnknownSession,
     Welcome,
 )
+from rig_protocol.sealed_channel import SEALED_OVERHEAD
+from rig_protocol.security import Cipher
 from support.wire import make_hello
 
 SIMPLE: list[Message] = [
-    Welcome(session_id=2**64 - 1, camera_id=255, color_codec=None, depth_codec=7, datagram_size=1472),
+    Welcome(2**64 - 1, 255, (), (7, 8), 1472, Cipher.AES_256_GCM),
     Reject(RejectReason.DUPLICATE_SLOT, "slot 3 ist schon vergeben – ü", 1, 4),
     Goodbye(""),
     Goodbye("the agent stops"),
@@ -39,43 +43,44 @@ SIMPLE: list[Message] = [
     Heartbeat({"temperature_c": 61.5, "load": 2.0}),
     ClockRequest(-(2**63)),
     ClockReply(1, -2, 2**63 - 1),
+    ClockReply(1, 2, 3, -(2**63), 2**64 - 2),
     UnknownSession(),
+    Heartbeat({}, 2**64 - 1),
+    Resend(2**64 - 1, ((0, 1), (7, 3), (65535, 65535))),
+    Resend(0, WHOLE_FRAME),
+    StreamPlan(2, None, 14.5, 1_000_000, 999_999),
 ]
 
 
-def decode(datagram: bytes) -> Message:
-    prefix = parse_prefix(datagram)
-    assert prefix is not None
-    return decode_message(prefix, datagram)
+def decode(kind: MessageType, values: Any) -> Message:
+    return decode_body(kind, msgpack.packb(values))
 
 
 def hello_values() -> dict[str, Any]:
     """The map that a good hello carries."""
-    values = msgpack.unpackb(encode_message(make_hello(), 1)[16:])
+    values = msgpack.unpackb(encode_body(make_hello())[1])
     assert isinstance(values, dict)
     return values
 
 
-def body_of(kind: MessageType, values: Any) -> bytes:
-    return pack_prefix(kind, 0, 1) + msgpack.packb(values)
-
-
 @pytest.mark.parametrize("message", SIMPLE, ids=lambda message: type(message).__name__)
 def test_a_message_survives_its_bytes(message: Message) -> None:
-    datagram = encode_message(message, 77)
-    prefix = parse_prefix(datagram)
-    assert prefix is not None
-    assert (prefix.id, prefix.crc) == (77, control_crc(datagram))
-    assert decode(datagram) == message
+    assert decode_body(*encode_body(message)) == message
 
 
 def test_a_hello_survives_its_bytes() -> None:
     lens = Intrinsics(529.2, 525.6, 328.9, 267.5, dist=(0.26, -0.84, -0.002, 0.001, 0.91))
-    sent = make_hello(camera_id=None, port_path=None, model=CameraModel(lens, None, None), fps=29.97)
-    received = decode(encode_message(sent, 5))
+    sent = make_hello(
+        camera_id=None,
+        port_path=None,
+        model=CameraModel(lens, None, None),
+        fps=29.97,
+        ciphers=(Cipher.CHACHA20_POLY1305, Cipher.AES_256_GCM),
+    )
+    received = decode_body(*encode_body(sent))
     assert isinstance(received, Hello)
     assert received.model.to_dict() == sent.model.to_dict()
-    names = ("name", "camera_id", "serial", "port_path", "color_codecs", "depth_codecs", "fps", "software")
+    names = [name for name in Hello.__slots__ if name != "model"]
     assert [getattr(received, name) for name in names] == [getattr(sent, name) for name in names]
 
 
@@ -83,8 +88,10 @@ def test_a_hello_is_never_shorter_than_the_answer_it_may_get() -> None:
     shortest = make_hello(
         name="x", serial=None, port_path=None, model=CameraModel(depth=None, T_color_depth=None)
     )
-    assert len(encode_message(shortest, 1)) >= MIN_HELLO_SIZE
-    assert len(encode_message(Reject(RejectReason.MALFORMED, "ü" * 5000), 1)) <= MIN_HELLO_SIZE
+    assert HELLO_OVERHEAD + len(encode_body(shortest)[1]) >= MIN_HELLO_SIZE
+    assert 16 + len(encode_body(Reject(RejectReason.MALFORMED, "ü" * 5000))[1]) <= MIN_HELLO_SIZE
+    longest = Welcome(2**64 - 1, 255, *(tuple(range(240, 256)),) * 2, 65507, Cipher.CHACHA20_POLY1305)
+    assert HELLO_OVERHEAD + len(encode_body(longest)[1]) <= MIN_HELLO_SIZE
 
 
 def test_the_longest_hello_is_one_datagram() -> None:
@@ -99,7 +106,7 @@ def test_the_longest_hello_is_one_datagram() -> None:
         color_codecs=codecs,
         depth_codecs=codecs,
     )
-    assert len(encode_message(longest, 1)) <= MAX_CONTROL_SIZE
+    assert HELLO_OVERHEAD + len(encode_body(longest)[1]) <= MAX_CONTROL_SIZE
 
 
 @pytest.mark.parametrize(
@@ -118,24 +125,25 @@ def test_the_longest_hello_is_one_datagram() -> None:
         {"color_codecs": (256,)},
         {"color_codecs": tuple(range(1, 18))},
         {"color_codecs": (), "depth_codecs": ()},
+        {"ciphers": ()},
     ],
 )
 def test_a_hello_over_the_limits_is_misuse_at_its_origin(changes: dict[str, Any]) -> None:
     with pytest.raises(LinkUsageError, match="this hello cannot be sent"):
-        encode_message(make_hello(**changes), 1)
+        encode_body(make_hello(**changes))
 
 
 @pytest.mark.parametrize("key", [key for key in hello_values() if key != "padding"])
 @pytest.mark.parametrize("value", [None, True, -1, 1.5, math.inf, "", "\x07", [], [[]], {}, b"x", 2**63])
 def test_a_hello_with_a_wrong_value_is_malformed_or_good_never_a_crash(key: str, value: Any) -> None:
-    datagram = body_of(MessageType.HELLO, {**hello_values(), key: value})
+    values = {**hello_values(), key: value}
     allowed = {"camera_id": [None], "serial": [None], "port_path": [None], "fps": [1.5]}
     streams = {"color_codecs": [[]], "depth_codecs": [[]]}
     if any(type(value) is type(good) and value == good for good in {**allowed, **streams}.get(key, [])):
-        assert isinstance(decode(datagram), Hello)
+        assert isinstance(decode(MessageType.HELLO, values), Hello)
     else:
         with pytest.raises(DataError):
-            decode(datagram)
+            decode(MessageType.HELLO, values)
 
 
 @pytest.mark.parametrize("key", [key for key in hello_values() if key != "padding"])
@@ -143,13 +151,21 @@ def test_a_hello_without_a_value_is_malformed(key: str) -> None:
     values = hello_values()
     del values[key]
     with pytest.raises(DataError):
-        decode(body_of(MessageType.HELLO, values))
+        decode(MessageType.HELLO, values)
 
 
 def test_keys_of_a_later_release_are_ignored() -> None:
-    values = {**hello_values(), "resend": {"budget": 0.25}}
+    values = {**hello_values(), "zoom": {"steps": 0.25}}
     del values["padding"]
-    assert isinstance(decode(body_of(MessageType.HELLO, values)), Hello)
+    assert isinstance(decode(MessageType.HELLO, values), Hello)
+
+
+def test_ciphers_of_a_later_release_are_passed_over_and_one_must_be_known() -> None:
+    later = decode(MessageType.HELLO, {**hello_values(), "ciphers": [9, 2, 77, 1]})
+    assert isinstance(later, Hello)
+    assert later.ciphers == (Cipher.CHACHA20_POLY1305, Cipher.AES_256_GCM)
+    with pytest.raises(DataError, match="no cipher that this version knows"):
+        decode(MessageType.HELLO, {**hello_values(), "ciphers": [9, 77]})
 
 
 @pytest.mark.parametrize(
@@ -158,20 +174,65 @@ def test_keys_of_a_later_release_are_ignored() -> None:
         {"session_id": 0},
         {"session_id": 2**64},
         {"camera_id": None},
-        {"color_codec": 0},
+        {"color_codecs": None},
+        {"color_codecs": [0]},
         {"datagram_size": 100},
         {"datagram_size": 65508},
+        {"cipher": 0},
+        {"cipher": 3},
+        {"cipher": [1]},
+        {"cipher": None},
     ],
     ids=str,
 )
 def test_a_welcome_out_of_range_is_malformed(values: dict[str, Any]) -> None:
-    good = {"session_id": 1, "camera_id": 0, "color_codec": 1, "depth_codec": None, "datagram_size": 1472}
-    assert isinstance(decode(body_of(MessageType.WELCOME, good)), Welcome)
+    good = {
+        "session_id": 1,
+        "camera_id": 0,
+        "color_codecs": [1],
+        "depth_codecs": [],
+        "datagram_size": 1472,
+        "cipher": 1,
+    }
+    assert isinstance(decode(MessageType.WELCOME, good), Welcome)
     broken = {**good, **values}
     if values == {"session_id": 2**64}:  # beyond MessagePack
         broken["session_id"] = 1.8e19
     with pytest.raises(DataError):
-        decode(body_of(MessageType.WELCOME, broken))
+        decode(MessageType.WELCOME, broken)
+
+
+PLAN: dict[str, Any] = {"color_codec": 2, "depth_codec": None, "fps": 30.0, "step_ns": 1000, "phase_ns": 999}
+
+
+@pytest.mark.parametrize(
+    "values",
+    [
+        *({"color_codec": codec} for codec in (0, 256, [1], True)),
+        *({"fps": fps} for fps in (0.0, math.nan, math.inf, 241.0, None)),
+        *({"step_ns": step_ns} for step_ns in (0, -1, 1_000_000_001, 1.5)),
+        *({"phase_ns": phase_ns} for phase_ns in (1000, -1, None)),
+    ],
+    ids=str,
+)
+def test_a_plan_out_of_range_is_malformed_and_cannot_be_sent(values: dict[str, Any]) -> None:
+    assert isinstance(decode(MessageType.PLAN, PLAN), StreamPlan)
+    with pytest.raises(DataError):
+        decode(MessageType.PLAN, PLAN | values)
+    with pytest.raises(LinkUsageError, match="this plan cannot be sent"):
+        encode_body(StreamPlan(**(PLAN | values)))
+
+
+@pytest.mark.parametrize("size", [0, 7, 8, 9, 13, 8 + 4 * MAX_RANGES + 4])
+def test_a_resend_holds_one_to_250_ranges(size: int) -> None:
+    with pytest.raises(DataError, match="resend body"):
+        decode_body(MessageType.RESEND, bytes(size))
+    most = Resend(1, ((5, 1),) * MAX_RANGES)
+    assert decode_body(*encode_body(most)) == most
+    assert SEALED_OVERHEAD + len(encode_body(most)[1]) <= MAX_CONTROL_SIZE
+    for ranges in ((), ((5, 1),) * (MAX_RANGES + 1)):
+        with pytest.raises(LinkUsageError):
+            encode_body(Resend(1, ranges))
 
 
 @pytest.mark.parametrize(
@@ -190,10 +251,16 @@ def test_a_welcome_out_of_range_is_malformed(values: dict[str, Any]) -> None:
 )
 def test_health_is_a_few_named_finite_numbers(health: Any) -> None:
     with pytest.raises(DataError):
-        decode(body_of(MessageType.HEARTBEAT, {"health": health}))
+        decode(MessageType.HEARTBEAT, {"health": health, "frames": 0})
     if isinstance(health, dict):
         with pytest.raises(LinkUsageError, match="heartbeat"):
-            encode_message(Heartbeat(health), 1)
+            encode_body(Heartbeat(health))
+
+
+@pytest.mark.parametrize("frames", [-1, None, 1.0, True])
+def test_a_heartbeat_counts_frames(frames: Any) -> None:
+    with pytest.raises(DataError, match="frames"):
+        decode(MessageType.HEARTBEAT, {"health": {}, "frames": frames})
 
 
 @pytest.mark.parametrize(
@@ -214,57 +281,52 @@ def test_health_is_a_few_named_finite_numbers(health: Any) -> None:
     ],
 )
 @pytest.mark.parametrize(
-    "kind", [MessageType.HELLO, MessageType.WELCOME, MessageType.GOODBYE, MessageType.HEARTBEAT]
+    "kind",
+    [
+        MessageType.HELLO,
+        MessageType.WELCOME,
+        MessageType.GOODBYE,
+        MessageType.HEARTBEAT,
+        MessageType.PLAN,
+    ],
 )
 def test_bytes_that_are_no_map_are_malformed(kind: MessageType, body: bytes) -> None:
     with pytest.raises(DataError):
-        decode(pack_prefix(kind, 0, 1) + body)
+        decode_body(kind, body)
 
 
 @pytest.mark.parametrize(
     "kind", [MessageType.CLOCK_REQUEST, MessageType.CLOCK_REPLY, MessageType.UNKNOWN_SESSION]
 )
 def test_a_fixed_body_of_another_size_is_malformed(kind: MessageType) -> None:
-    for size in (1, 7, 9, 23, 25):
+    for size in (1, 7, 9, 24, 39, 41):
         with pytest.raises(DataError):
-            decode(pack_prefix(kind, 0, 1) + bytes(size))
+            decode_body(kind, bytes(size))
 
 
 def test_a_control_message_is_at_most_1200_bytes() -> None:
-    with pytest.raises(DataError, match="1201"):
-        decode(pack_prefix(MessageType.GOODBYE, 0, 1) + bytes(1185))
+    widest = make_hello(model=CameraModel(color=Intrinsics(525, 525, 319, 239)), name="n" * 64)
+    for message in (
+        widest,
+        Resend(1, ((5, 1),) * MAX_RANGES),
+        Heartbeat({f"{i:032}": 1.0 for i in range(16)}),
+    ):
+        assert HELLO_OVERHEAD + len(encode_body(message)[1]) <= MAX_CONTROL_SIZE
 
 
 def test_a_reject_of_a_later_version_is_readable() -> None:
     text = "nie gehört \x1b[2J".encode()
     body = bytes((99, 2, 7, 123)) + text + b"\xff"
-    reject = decode(pack_prefix(MessageType.REJECT, 0, 1) + body)
+    reject = decode_body(MessageType.REJECT, body)
     assert reject == Reject(RejectReason.OTHER, "nie gehört ?[2J\N{REPLACEMENT CHARACTER}", 2, 7)
 
 
 @pytest.mark.parametrize("size", [0, 3, 497])
 def test_a_reject_that_is_too_short_or_too_long_is_malformed(size: int) -> None:
     with pytest.raises(DataError):
-        decode(pack_prefix(MessageType.REJECT, 0, 1) + bytes(size))
+        decode_body(MessageType.REJECT, bytes(size))
 
 
 def test_texts_are_cut_to_their_limit_between_characters() -> None:
-    goodbye = decode(encode_message(Goodbye("ü" * 150 + "\n"), 1))
+    goodbye = decode_body(*encode_body(Goodbye("ü" * 150 + "\n")))
     assert goodbye == Goodbye("ü" * 100)
-
-
-def test_decoding_another_type_as_a_hello_is_misuse() -> None:
-    datagram = encode_message(Goodbye("x"), 1)
-    prefix = parse_prefix(datagram)
-    assert prefix is not None
-    with pytest.raises(LinkUsageError):
-        decode_hello(prefix, datagram)
-
-
-@pytest.mark.parametrize("harm", [lambda d: d[:-1], lambda d: d + b"\0", lambda d: d[:20] + b"!" + d[21:]])
-def test_the_crc_covers_the_whole_message(harm: Callable[[bytes], bytes]) -> None:
-    datagram = encode_message(make_hello(), 1)
-    harmed = harm(datagram)
-    prefix = parse_prefix(harmed)
-    assert prefix is not None
-    assert prefix.crc != control_crc(harmed)

@@ -12,14 +12,19 @@ from rig_protocol.datagram import (
     parse_fragment_header,
 )
 from rig_protocol.fragmenter import fragment
-from rig_protocol.frame_unit import MAX_UNIT_SIZE
+from rig_protocol.frame_unit import FRAME_HEADER_SIZE, MAX_SEALED_SIZE, MAX_UNIT_SIZE, MIN_SEALED_SIZE
 from rig_protocol.frames import EncodedFrame
+from rig_protocol.messages import Resend
 from rig_protocol.reassembler import GRACE_NS, MAX_OPEN_UNITS, NUMBER_WINDOW, Reassembler
-from support.wire import make_frame
+from rig_protocol.security import TAG_SIZE
+from support.wire import make_frame, make_seal
 
 SESSION = 5
 SIZE = 4000  # three fragments
+# Two full fragments, so that all datagrams are equally long.
+TWO_FULL = 2 * 1440 - FRAME_HEADER_SIZE - TAG_SIZE
 FRAME_INTERVAL_NS = 33_333_333
+SEAL = make_seal()
 
 
 class Bench:
@@ -27,8 +32,9 @@ class Bench:
 
     def __init__(self) -> None:
         self.counters = CameraCounters()
-        self.reassembler = Reassembler(0, 30.0, self.counters)
+        self.reassembler = make_reassembler(self.counters)
         self.delivered: list[int] = []
+        self.requests: list[Resend] = []
 
     def feed(self, datagrams: Iterable[bytes | memoryview], now_ns: int = 0) -> "Bench":
         """Take datagrams one by one."""
@@ -47,14 +53,28 @@ class Bench:
                 self.delivered.append(frame.sequence)
         return self
 
+    def pass_time(self, now_ns: int) -> "Bench":
+        """Serve the reassembler whenever it is due, until `now_ns`."""
+        while self.reassembler.due_ns <= now_ns:
+            self.requests += self.reassembler.handle_timeout(self.reassembler.due_ns)
+        return self
+
     def counted(self) -> dict[str, int]:
-        """Counters that are not zero."""
+        """Counters of frames and fragments that are not zero; requests apart."""
         names = (name for name in CameraCounters.__slots__ if getattr(self.counters, name))
-        return {name: getattr(self.counters, name) for name in names}
+        return {name: getattr(self.counters, name) for name in names if name != "requested"}
+
+
+def make_reassembler(counters: CameraCounters | None = None) -> Reassembler:
+    return Reassembler(0, 30.0, counters or CameraCounters(), SEAL)
+
+
+def cut(number: int, size: int = SIZE) -> DatagramBatch:
+    return fragment(make_frame(number, size=size), SESSION, number, SEAL)
 
 
 def datagrams(number: int, size: int = SIZE) -> list[bytes]:
-    return [bytes(datagram) for datagram in fragment(make_frame(number, size=size), SESSION)]
+    return [bytes(datagram) for datagram in cut(number, size)]
 
 
 def with_header(datagram: bytes, **changes: int) -> bytes:
@@ -83,7 +103,7 @@ def test_fragments_may_come_in_any_order_of_interleaved_frames(seed: int) -> Non
 def test_batches_and_single_datagrams_give_the_same(together: int) -> None:
     bench = Bench()
     for number in range(10):
-        batch = fragment(make_frame(number, size=SIZE), SESSION)
+        batch = cut(number)
         for start in range(0, len(batch), together):
             bench.feed_batch(DatagramBatch(batch.part(start, start + together), batch.segment_size))
     assert bench.delivered == list(range(10))
@@ -91,16 +111,14 @@ def test_batches_and_single_datagrams_give_the_same(together: int) -> None:
 
 
 def test_a_batch_may_hold_the_end_of_one_frame_and_the_start_of_the_next() -> None:
-    # 1408 + 1440 bytes: two full fragments a frame, so that all datagrams are equally long.
-    frames = [fragment(make_frame(number, size=2848), SESSION) for number in range(3)]
+    frames = [cut(number, TWO_FULL) for number in range(3)]
     content = b"".join(bytes(batch.buffer) for batch in frames)
-    counters = CameraCounters()
-    reassembler, delivered = Reassembler(0, 30.0, counters), []
+    reassembler, delivered = make_reassembler(), []
     for count, run in consecutive_runs(DatagramBatch(content, 1472)):
         header = parse_fragment_header(run)
         assert header is not None
         delivered.append(reassembler.receive(header, run, count, 0))
-    assert delivered == [make_frame(number, size=2848) for number in range(3)]
+    assert delivered == [make_frame(number, size=TWO_FULL) for number in range(3)]
 
 
 def test_a_fragment_held_already_is_a_duplicate_before_and_after_completion() -> None:
@@ -111,7 +129,7 @@ def test_a_fragment_held_already_is_a_duplicate_before_and_after_completion() ->
 
 
 def test_a_run_that_is_held_in_part_fills_the_rest() -> None:
-    batch = fragment(make_frame(0, size=SIZE), SESSION)
+    batch = cut(0)
     bench = Bench().feed([batch[1]])
     bench.feed_batch(batch)
     assert bench.delivered == [0]
@@ -133,7 +151,7 @@ def test_altered_content_makes_the_frame_corrupt_not_wrong() -> None:
 
 @pytest.mark.parametrize(
     "changes",
-    [{"frame_number": 4}, {"frame_crc": 77}, {"unit_size": 4031}, {"payload_size": 1439}],
+    [{"frame_number": 4}, {"seal": 77}, {"unit_size": 4047}, {"payload_size": 1439}],
     ids=lambda changes: next(iter(changes)),
 )
 def test_a_bit_error_in_a_header_does_not_spoil_the_true_frame(changes: dict[str, int]) -> None:
@@ -141,24 +159,22 @@ def test_a_bit_error_in_a_header_does_not_spoil_the_true_frame(changes: dict[str
     bench.feed([with_header(datagrams(0)[0], **changes)])
     bench.feed(datagrams(0))
     assert bench.delivered == [0]
-    bench.reassembler.expire(10**12)
+    bench.pass_time(10**12)
     assert bench.feed(datagrams(4)).delivered == [0, 4]
 
 
 def test_an_incomplete_frame_expires_after_its_interval_and_the_grace() -> None:
     bench = Bench().feed(datagrams(0)[:2], now_ns=1000)
-    due_ns = bench.reassembler.next_deadline_ns
-    assert due_ns == 1000 + FRAME_INTERVAL_NS + GRACE_NS
-    bench.reassembler.expire(due_ns - 1)
+    due_ns = 1000 + FRAME_INTERVAL_NS + GRACE_NS
+    bench.pass_time(due_ns - 1)
     assert "incomplete" not in bench.counted()
-    bench.reassembler.expire(due_ns)
+    bench.pass_time(due_ns)
     assert bench.counted() == {"fragments": 2, "incomplete": 1}
-    assert bench.reassembler.next_deadline_ns is None
+    assert bench.reassembler.due_ns > 10**18
 
 
 def test_fragments_of_an_expired_frame_are_late() -> None:
-    bench = Bench().feed(datagrams(0)[:2])
-    bench.reassembler.expire(10**12)
+    bench = Bench().feed(datagrams(0)[:2]).pass_time(10**12)
     bench.feed(datagrams(0)[2:])
     assert bench.counted() == {"fragments": 2, "incomplete": 1, "late": 1}
 
@@ -195,7 +211,7 @@ def test_a_lost_frame_is_counted_once_whatever_the_cause() -> None:
         whole = datagrams(number)
         broken = {10: whole[:1], 11: [], 12: [whole[0][:-1] + b"?", *whole[1:]]}
         bench.feed(broken.get(number, whole), now_ns=number * FRAME_INTERVAL_NS)
-        bench.reassembler.expire(number * FRAME_INTERVAL_NS)
+        bench.pass_time(number * FRAME_INTERVAL_NS)
     assert len(bench.delivered) == 97
     assert (bench.counters.incomplete, bench.counters.missing, bench.counters.corrupt) == (1, 1, 1)
 
@@ -206,8 +222,19 @@ def test_at_the_end_of_a_session_what_is_open_or_was_skipped_is_counted_as_lost(
     assert (bench.counters.incomplete, bench.counters.missing) == (2, 3)
 
 
+@pytest.mark.parametrize("whole", [[], [0, 1, 2], [0, 2, 6]])
+def test_at_the_end_of_a_session_missing_is_exactly_what_the_agent_says_it_sent(whole: list[int]) -> None:
+    bench = Bench()
+    for number in whole:
+        bench.feed(datagrams(number))
+    bench.reassembler.heard_of(7, 0)
+    bench.reassembler.close()
+    assert (bench.counters.missing, bench.counters.lost) == (7 - len(whole), 7 - len(whole))
+
+
 def test_a_session_without_frames_ends_without_loss() -> None:
     bench = Bench()
+    bench.reassembler.heard_of(0, 0)
     bench.reassembler.close()
     assert bench.counted() == {}
 
@@ -221,9 +248,9 @@ def test_only_a_verified_frame_moves_the_window() -> None:
 @pytest.mark.parametrize(
     ("changes", "cause"),
     [
-        ({"unit_size": MAX_UNIT_SIZE + 1}, "oversized"),
+        ({"unit_size": MAX_SEALED_SIZE + 1}, "oversized"),
         ({"unit_size": 2**32 - 1}, "oversized"),
-        ({"unit_size": 31}, "bad_fragment"),
+        ({"unit_size": MIN_SEALED_SIZE - 1}, "bad_fragment"),
         ({"payload_size": 1}, "bad_fragment"),
         ({"payload_size": 1000}, "bad_fragment"),
         ({"payload_size": 1441}, "bad_fragment"),
@@ -236,7 +263,7 @@ def test_only_a_verified_frame_moves_the_window() -> None:
 def test_a_fragment_that_does_not_fit_its_unit_is_dropped(changes: dict[str, int], cause: str) -> None:
     bench = Bench().feed([with_header(datagrams(0)[0], **changes)])
     assert bench.counted() == {cause: 1}
-    assert bench.reassembler.next_deadline_ns is None
+    assert bench.reassembler.due_ns > 10**18
 
 
 @pytest.mark.parametrize("index", [0, 2])
@@ -246,14 +273,22 @@ def test_a_truncated_or_extended_fragment_is_dropped(index: int) -> None:
     assert bench.counted() == {"bad_fragment": 2}
 
 
+def test_a_unit_of_fewer_bytes_than_a_seal_and_a_header_is_dropped() -> None:
+    header = parse_fragment_header(datagrams(0)[0])
+    assert header is not None
+    size = MIN_SEALED_SIZE - 1
+    bench = Bench().feed([pack_fragment_header(header._replace(unit_size=size)) + bytes(size)])
+    assert bench.counted() == {"bad_fragment": 1}
+
+
 def test_a_run_past_the_end_of_its_unit_delivers_what_fits() -> None:
-    frame = fragment(make_frame(0, size=2848), SESSION)  # two full fragments
+    frame = cut(0, TWO_FULL)
     beyond = [with_header(bytes(frame[1]), fragment_index=index) for index in (2, 3)]
     header = parse_fragment_header(frame[0])
     assert header is not None
     counters = CameraCounters()
     run = bytes(frame.buffer) + b"".join(beyond)
-    assert Reassembler(0, 30.0, counters).receive(header, run, 4, 0) == make_frame(0, size=2848)
+    assert make_reassembler(counters).receive(header, run, 4, 0) == make_frame(0, size=TWO_FULL)
     assert (counters.fragments, counters.bad_fragment + counters.duplicate) == (2, 2)
 
 
@@ -261,30 +296,59 @@ def test_a_run_whose_index_wraps_is_dropped() -> None:
     header = FragmentHeader(1, SESSION, 0, 4000, 1440, 65535)
     run = b"".join(pack_fragment_header(header._replace(fragment_index=i)) + bytes(1440) for i in (65535, 0))
     counters = CameraCounters()
-    assert Reassembler(0, 30.0, counters).receive(header, run, 2, 0) is None
+    assert make_reassembler(counters).receive(header, run, 2, 0) is None
     assert (counters.bad_fragment, counters.fragments) == (1, 1)
+
+
+def hostile(number: int, seal: int = 1, **changes: int) -> bytes:
+    return with_header(datagrams(0)[0], frame_number=number, seal=seal, **changes)
 
 
 def test_what_hostile_headers_make_it_hold_is_bounded() -> None:
     bench = Bench()
     chaos = random.Random(1)
-    template = datagrams(0)[0]
-    for _ in range(3000):
-        bench.feed(
-            [with_header(template, frame_number=chaos.getrandbits(64), frame_crc=chaos.getrandbits(32))]
-        )
+    for k in range(3000):
+        number = chaos.choice([chaos.getrandbits(64), chaos.randrange(100)])
+        bench.feed([hostile(number, chaos.getrandbits(32))], now_ns=k * 10_000).pass_time(k * 10_000)
     reassembler = bench.reassembler
     assert len(reassembler._open) == MAX_OPEN_UNITS
     assert len(reassembler._lost_keys) <= 64
-    assert len(reassembler._fates) <= 1024
+    assert len(reassembler._given_up) <= 1024
+    assert len(reassembler._unseen) <= 4 * NUMBER_WINDOW
 
 
-def test_a_frame_of_two_megabytes_passes_and_an_empty_one_too() -> None:
-    for size in (MAX_UNIT_SIZE - 32, 0):
-        frame: EncodedFrame | None = None
-        reassembler = Reassembler(0, 30.0, CameraCounters())
-        for count, run in consecutive_runs(fragment(make_frame(0, size=size), SESSION)):
-            header = parse_fragment_header(run)
-            assert header is not None
-            frame = reassembler.receive(header, run, count, 0)
-        assert frame == make_frame(0, size=size)
+def test_memory_of_units_of_the_most_fragments_is_bounded_and_so_is_what_is_asked_for() -> None:
+    """65,536 fragments of 32 bytes, of which every second one came: the costliest gaps to ask for."""
+    bench = Bench()
+    header = FragmentHeader(7, SESSION, 0, MAX_UNIT_SIZE, 32, 0)
+    for number in range(MAX_OPEN_UNITS + 2):
+        for index in range(1, 1200, 2):
+            one = header._replace(frame_number=number, fragment_index=index)
+            bench.feed([pack_fragment_header(one) + bytes(32)], now_ns=number)
+    requests = bench.reassembler.handle_timeout(5_000_000)
+    assert all(len(request.ranges) <= 250 for request in requests)
+    held = [len(unit.content) for unit in bench.reassembler._open.values()]
+    assert sum(held) <= MAX_OPEN_UNITS * MAX_SEALED_SIZE
+    bench.pass_time(10**12)
+    assert bench.reassembler._open == {}
+    assert sum(map(len, bench.reassembler._spare)) <= 2 * MAX_SEALED_SIZE
+
+
+def test_no_flood_of_forged_headers_makes_a_delivered_frame_come_again() -> None:
+    bench = Bench().feed(datagrams(0)).feed(datagrams(1))
+    for k in range(1100):
+        bench.feed([hostile(2**60 + k)]).feed([hostile(5, seal=k)])
+    bench.feed(datagrams(1)).feed(datagrams(0))
+    assert bench.delivered == [0, 1]
+    assert bench.counters.duplicate == 6
+
+
+@pytest.mark.parametrize("size", [MAX_UNIT_SIZE - FRAME_HEADER_SIZE, 0])
+def test_a_frame_of_two_megabytes_passes_and_an_empty_one_too(size: int) -> None:
+    frame: EncodedFrame | None = None
+    reassembler = make_reassembler()
+    for count, run in consecutive_runs(cut(0, size)):
+        header = parse_fragment_header(run)
+        assert header is not None
+        frame = reassembler.receive(header, run, count, 0)
+    assert frame == make_frame(0, size=size)

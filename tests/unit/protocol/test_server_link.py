@@ -1,15 +1,19 @@
+import zlib
+from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import msgpack
 import pytest
 
 from rig_protocol.agent_link import AgentLink
-from rig_protocol.datagram import MAGIC, Buffer, DatagramBatch, MessageType, pack_prefix, parse_prefix
+from rig_protocol.clear_datagram import clear_crc, encode_clear
+from rig_protocol.datagram import MAGIC, Buffer, DatagramBatch, MessageType, pack_prefix
 from rig_protocol.errors import LinkUsageError
 from rig_protocol.event_queue import MAX_FRAMES
 from rig_protocol.events import Address, CameraJoined, CameraLeft, FrameReceived, HelloRefused
 from rig_protocol.frames import Payload
-from rig_protocol.message_bytes import MIN_HELLO_SIZE, control_crc, decode_message, encode_message
+from rig_protocol.message_bytes import MIN_HELLO_SIZE, encode_body
 from rig_protocol.messages import (
     ClockReply,
     ClockRequest,
@@ -19,15 +23,21 @@ from rig_protocol.messages import (
     Message,
     Reject,
     RejectReason,
+    StreamChoice,
+    StreamPlan,
     UnknownSession,
-    Welcome,
 )
+from rig_protocol.pending_sessions import MAX_PENDING
+from rig_protocol.rig_key import RigKey
 from rig_protocol.roster import Roster, Slot
+from rig_protocol.security import Cipher, hello_aead, seal_once
 from rig_protocol.server_link import ServerLink
+from support.peers import AgentPeer, clear_message
 from support.wire import (
     AGENT,
     COLOR,
     DEPTH,
+    KEY,
     OTHER,
     SECOND_NS,
     T0,
@@ -39,36 +49,58 @@ from support.wire import (
     roundtrip,
 )
 
-HELLO = encode_message(make_hello(), 1)
+HELLO = AgentPeer().hello
+STEP_NS = 10_000_000  # of the server between two handshakes
 
 
 def with_crc(datagram: bytes | bytearray) -> bytes:
     """The datagram with the crc that it should have."""
-    return bytes(datagram[:4]) + control_crc(bytes(datagram)).to_bytes(4, "little") + bytes(datagram[8:])
+    return bytes(datagram[:4]) + clear_crc(bytes(datagram)).to_bytes(4, "little") + bytes(datagram[8:])
 
 
-def answers(server: ServerLink, now_ns: int = T0) -> list[tuple[Message, Address]]:
-    """What the server sends beside clock requests."""
-    messages = []
-    for datagram, address in server.datagrams_to_send(now_ns):
-        prefix = parse_prefix(datagram)
-        assert prefix is not None
-        if prefix.type != MessageType.CLOCK_REQUEST:
-            messages.append((decode_message(prefix, datagram), address))
-    return messages
+def clear(message: Message, id_: int) -> bytes:
+    return encode_clear(*encode_body(message), id_)
+
+
+def sealed_hello(body: bytes, nonce: int = 1, public: bytes = bytes(32), rig_key: RigKey = KEY) -> bytes:
+    """A hello of any body and public key by somebody who holds the key."""
+    associated = pack_prefix(MessageType.HELLO, 0, nonce) + public
+    return encode_clear(
+        MessageType.HELLO, public + seal_once(hello_aead(rig_key, public), body, associated), nonce
+    )
 
 
 def the_answer(server: ServerLink, now_ns: int = T0) -> Message:
-    [(message, _)] = answers(server, now_ns)
-    return message
+    """The only answer, outside of any session."""
+    [(datagram, _)] = server.datagrams_to_send(now_ns)
+    return clear_message(datagram)
+
+
+def welcomed(server: ServerLink, peer: AgentPeer, address: Address = AGENT, now_ns: int = T0) -> AgentPeer:
+    """The peer with a welcome; the server has not heard from it since."""
+    server.receive_datagram(peer.hello, address, now_ns)
+    [(welcome, to)] = [(d, a) for d, a in server.datagrams_to_send(now_ns) if d[3] == MessageType.WELCOME]
+    assert to == address
+    peer.accept(welcome)
+    return peer
+
+
+def joined_peer(
+    server: ServerLink, address: Address = AGENT, now_ns: int = T0, seed: int = 8, **changes: Any
+) -> AgentPeer:
+    """A peer in session; its joining is taken from the events."""
+    peer = welcomed(server, AgentPeer(make_hello(**changes), seed=seed), address, now_ns)
+    server.receive_datagram(peer.seal(Heartbeat({})), address, now_ns)
+    assert [type(event) for event in events_of(server)] == [CameraJoined]
+    return peer
 
 
 def joined(
-    server: ServerLink, hello: Hello | None = None, seed: int = 2, address: Address = AGENT
+    server: ServerLink, hello: Hello | None = None, seed: int = 2, address: Address = AGENT, now_ns: int = T0
 ) -> AgentLink:
     """A connected agent, its clock known; the event of its joining is taken."""
     agent = make_agent(hello, seed)
-    roundtrip(agent, server, address)
+    roundtrip(agent, server, address, now_ns)
     assert agent.connected
     events_of(server)
     return agent
@@ -88,63 +120,134 @@ def deliver(server: ServerLink, agent: AgentLink, now_ns: int = T0, **changes: A
 # ---- welcome
 
 
-def test_a_camera_is_welcomed_with_the_first_common_codec_of_its_order() -> None:
+def test_a_camera_is_welcomed_with_the_common_codecs_in_its_order() -> None:
     server = make_server(color_codecs=(1, 2, 3), depth_codecs=(9, 5))
-    hello = make_hello(color_codecs=(7, 3, 1), depth_codecs=(5, 9))
-    server.receive_datagram(encode_message(hello, 1), AGENT, T0)
-    welcome = the_answer(server)
-    assert isinstance(welcome, Welcome)
-    assert (welcome.camera_id, welcome.color_codec, welcome.depth_codec) == (0, 3, 5)
-    [event] = events_of(server)
-    assert isinstance(event, CameraJoined)
-    assert (event.camera_id, event.hello.name, event.address) == (0, "cam00", AGENT)
+    peer = AgentPeer(make_hello(color_codecs=(7, 3, 1), depth_codecs=(5, 9)))
+    server.receive_datagram(peer.hello, AGENT, T0)
+    [(datagram, _)] = server.datagrams_to_send(T0)
+    welcome = peer.accept(datagram)
+    assert (welcome.camera_id, welcome.color_codecs, welcome.depth_codecs) == (0, (3, 1), (5, 9))
 
 
 def test_a_stream_that_is_not_offered_is_not_chosen() -> None:
-    server = make_server()
-    server.receive_datagram(encode_message(make_hello(color_codecs=()), 1), AGENT, T0)
-    welcome = the_answer(server)
-    assert isinstance(welcome, Welcome)
-    assert (welcome.color_codec, welcome.depth_codec) == (None, DEPTH)
+    server, peer = make_server(), AgentPeer(make_hello(color_codecs=()))
+    server.receive_datagram(peer.hello, AGENT, T0)
+    [(datagram, _)] = server.datagrams_to_send(T0)
+    welcome = peer.accept(datagram)
+    assert (welcome.color_codecs, welcome.depth_codecs) == ((), (DEPTH,))
 
 
-def test_a_repeated_hello_gets_the_same_welcome_and_no_new_session() -> None:
+@pytest.mark.parametrize("ciphers", [tuple(Cipher), tuple(reversed(Cipher)), (Cipher.AES_256_GCM,)])
+def test_the_agents_first_cipher_is_taken_and_works_end_to_end(ciphers: tuple[Cipher, ...]) -> None:
     server = make_server()
-    server.receive_datagram(HELLO, AGENT, T0)
-    first = the_answer(server)
-    server.receive_datagram(HELLO, AGENT, T0 + 100)
-    assert the_answer(server) == first
+    agent = joined(server, make_hello(ciphers=ciphers))
+    assert agent.session is not None
+    assert agent.session.cipher is ciphers[0]
+    deliver(server, agent)
+    assert [type(event) for event in events_of(server)] == [FrameReceived]
+
+
+def test_a_session_begins_with_the_agents_first_sealed_message_not_with_its_hello() -> None:
+    server = make_server()
+    peer = welcomed(server, AgentPeer())
+    assert events_of(server) == []
+    assert server.cameras == {}
+    server.receive_datagram(peer.seal(Heartbeat({"t": 1.0})), AGENT, T0)
+    [event] = events_of(server)
+    assert isinstance(event, CameraJoined)
+    assert (event.camera_id, event.hello.name, event.address) == (0, "cam00", AGENT)
+    assert server.cameras[0].health == {"t": 1.0}
+    server.handle_timeout(T0)
+    assert peer.read(datagram for datagram, _ in server.datagrams_to_send(T0)) == [ClockRequest(T0)]
+
+
+def test_a_repeated_hello_gets_the_same_welcome_and_no_second_handshake() -> None:
+    server = make_server()
+    for k in range(3):
+        server.receive_datagram(HELLO, AGENT, T0 + k)
+    first, *others = server.datagrams_to_send(T0)
+    assert others == [first, first]
+    assert server.rejected == {}
+
+
+def test_an_agent_that_opened_its_socket_anew_is_answered_at_its_new_address() -> None:
+    server, peer = make_server(), AgentPeer()
+    server.receive_datagram(peer.hello, AGENT, T0)
+    server.datagrams_to_send(T0)  # lost
+    welcomed(server, peer, OTHER, T0 + STEP_NS)
+    server.receive_datagram(peer.seal(Heartbeat({})), OTHER, T0 + STEP_NS)
     assert [type(event) for event in events_of(server)] == [CameraJoined]
 
 
-def test_a_late_copy_of_an_old_hello_does_not_end_the_session() -> None:
+def test_a_recorded_hello_of_a_session_that_began_changes_nothing() -> None:
     server = make_server()
-    server.receive_datagram(HELLO, AGENT, T0)
-    server.receive_datagram(encode_message(make_hello(), 2), AGENT, T0)
-    events_of(server), answers(server)
-    server.receive_datagram(HELLO, AGENT, T0)
-    server.receive_datagram(HELLO, OTHER, T0)
-    assert (events_of(server), answers(server)) == ([], [])
+    peer = joined_peer(server)
+    server.receive_datagram(peer.hello, AGENT, T0 + STEP_NS)
+    server.receive_datagram(peer.hello, OTHER, T0 + 2 * STEP_NS)
+    assert (events_of(server), server.datagrams_to_send(T0)) == ([], [])
     assert server.rejected == {"stale_hello": 2}
+    server.receive_datagram(peer.seal(Heartbeat({"still": 1.0})), AGENT, T0)
+    assert server.cameras[0].health == {"still": 1.0}
+
+
+def test_a_recorded_hello_of_before_the_servers_restart_is_answered_and_changes_nothing() -> None:
+    """Nobody can know that it is old; only who holds its secrets can go on from there."""
+    server = make_server()
+    live = joined_peer(server, seed=9)
+    recorded = AgentPeer(seed=10).hello
+    server.receive_datagram(recorded, AGENT, T0 + STEP_NS)
+    [(welcome, _)] = server.datagrams_to_send(T0 + STEP_NS)
+    assert len(welcome) <= len(recorded)
+    server.receive_datagram(pack_prefix(MessageType.HEARTBEAT, 0, 1) + bytes(40), AGENT, T0 + STEP_NS)
+    assert events_of(server) == []
+    server.receive_datagram(live.seal(Heartbeat({"still": 1.0})), AGENT, T0 + STEP_NS)
+    assert server.cameras[0].health == {"still": 1.0}
+
+
+def test_a_flood_of_recorded_hellos_costs_a_bounded_table_and_a_hundred_handshakes_a_second() -> None:
+    server = make_server()
+    live = joined_peer(server)
+    hellos = [AgentPeer(seed=100 + k).hello for k in range(1000)]
+    answered = []
+    for k, hello in enumerate(hellos):
+        now_ns = T0 + k * 1_000_000
+        server.receive_datagram(hello, OTHER, now_ns)
+        answered += [now_ns for _, to in server.datagrams_to_send(now_ns) if to == OTHER]
+    assert sum(now_ns >= T0 + SECOND_NS // 2 for now_ns in answered) == 50
+    assert len(answered) <= 100 + 32  # what was saved up before
+    assert len(server._pending._by_id) == len(server._pending._ids) == MAX_PENDING
+    assert server.rejected == {"handshake_limit": 1000 - len(answered)}
+    server.receive_datagram(live.seal(Heartbeat({"still": 1.0})), AGENT, now_ns)
+    assert server.cameras[0].health == {"still": 1.0}
+
+
+def test_a_whole_rig_that_says_hello_in_the_same_moment_is_welcomed_at_once() -> None:
+    server = make_server()
+    for camera_id in range(12):
+        peer = AgentPeer(make_hello(camera_id=camera_id, serial=f"S{camera_id}"), seed=100 + camera_id)
+        welcomed(server, peer, (AGENT[0], camera_id), T0)
 
 
 def test_session_ids_come_from_the_source_but_never_zero_or_twice() -> None:
-    source = iter([0, 5, 5, 0, 6])
-    server = ServerLink(Roster(open=True), lambda: next(source), (COLOR,), (DEPTH,))
+    ids = iter([0, 5, 5, 0, 6])
+    server = make_server(random_bytes=lambda n: next(ids).to_bytes(8, "little") if n == 8 else bytes([7]) * n)
+    welcomes = []
     for camera_id in (0, 1):
-        hello = make_hello(camera_id=camera_id, serial=f"S{camera_id}")
-        server.receive_datagram(encode_message(hello, 1), (AGENT[0], camera_id), T0)
-    welcomes = [message.session_id for message, _ in answers(server) if isinstance(message, Welcome)]
+        peer = AgentPeer(make_hello(camera_id=camera_id, serial=f"S{camera_id}"), seed=camera_id)
+        server.receive_datagram(peer.hello, (AGENT[0], camera_id), T0 + camera_id * STEP_NS)
+        [(datagram, _)] = server.datagrams_to_send(T0)
+        welcomes.append(peer.accept(datagram).session_id)
     assert welcomes == [5, 6]
 
 
 def test_a_restarted_agent_replaces_its_session_at_once() -> None:
     server = make_server()
-    old = joined(server)
+    old = joined_peer(server)
     new = make_agent(seed=3)
-    roundtrip(new, server, OTHER)  # same serial, another port
+    roundtrip(new, server, OTHER, T0 + STEP_NS)  # same serial, another port
     assert [type(event) for event in events_of(server)] == [CameraLeft, CameraJoined]
-    server.receive_datagram(encode_message(Heartbeat({}), session_id(old)), AGENT, T0)
+    server.datagrams_to_send(T0)
+    server.receive_datagram(old.seal(Heartbeat({})), AGENT, T0 + SECOND_NS)
     assert isinstance(the_answer(server), UnknownSession)
     assert server.cameras[0].address == OTHER
 
@@ -152,19 +255,42 @@ def test_a_restarted_agent_replaces_its_session_at_once() -> None:
 # ---- refusals
 
 
-def test_a_hello_of_another_version_is_answered_readably_in_all_versions() -> None:
+@pytest.mark.parametrize("version", [1, 7])
+def test_a_hello_of_another_version_is_answered_readably_in_all_versions(version: int) -> None:
     server = make_server()
-    later = bytearray(pack_prefix(MessageType.HELLO, 0, 1234) + bytes(600))  # a body that we cannot read
-    later[2] = 7
-    server.receive_datagram(with_crc(later), AGENT, T0)
+    foreign = bytearray(pack_prefix(MessageType.HELLO, 0, 1234) + bytes(600))  # a body that we cannot read
+    foreign[2] = version
+    server.receive_datagram(with_crc(foreign), AGENT, T0)
     [(datagram, address)] = server.datagrams_to_send(T0)
     assert address == AGENT
-    assert (datagram[:4], datagram[8:16]) == (b"KR\x01\x03", (1234).to_bytes(8, "little"))
-    assert tuple(datagram[16:20]) == (RejectReason.VERSION_MISMATCH.value, 1, 1, 0)
+    assert (datagram[:4], datagram[8:16]) == (b"KR\x02\x03", (1234).to_bytes(8, "little"))
+    assert tuple(datagram[16:20]) == (RejectReason.VERSION_MISMATCH.value, 2, 2, 0)
+    assert int.from_bytes(datagram[4:8], "little") == zlib.crc32(datagram[:4] + datagram[8:])
     text = datagram[20:].decode()
-    assert "the agent speaks protocol version 7, this server speaks 1" in text
+    assert f"the agent speaks protocol version {version}, this server speaks 2" in text
     assert events_of(server) == [HelloRefused(AGENT, RejectReason.VERSION_MISMATCH, text)]
     assert server.rejected == {"refused_version_mismatch": 1}
+
+
+@pytest.mark.parametrize(
+    ("rig_key", "agents_key", "advice"),
+    [
+        (KEY, RigKey(bytes(32)), "copy the server's key file to the agent's machine"),
+        (KEY, RigKey.INSECURE, "start neither with --insecure"),
+        (RigKey.INSECURE, KEY, "this server runs with --insecure, the agent does not"),
+    ],
+)
+def test_an_agent_with_another_key_is_refused_and_told_what_to_do(
+    rig_key: RigKey, agents_key: RigKey, advice: str
+) -> None:
+    server, agent = make_server(rig_key=rig_key), make_agent(rig_key=agents_key)
+    roundtrip(agent, server)
+    [rejected] = events_of(agent)
+    assert rejected.reason is RejectReason.WRONG_KEY
+    assert advice in rejected.text
+    assert events_of(server) == [HelloRefused(AGENT, RejectReason.WRONG_KEY, rejected.text)]
+    assert server.rejected == {"refused_wrong_key": 1}
+    assert server.cameras == {}
 
 
 @pytest.mark.parametrize(
@@ -181,7 +307,7 @@ def test_a_hello_of_another_version_is_answered_readably_in_all_versions() -> No
 )
 def test_a_refusal_tells_both_sides_why(hello: Hello, reason: RejectReason, words: str) -> None:
     server = make_server(Roster((Slot(0, "front"), Slot(1, "left", serial="S1"))))
-    server.receive_datagram(encode_message(hello, 1), AGENT, T0)
+    server.receive_datagram(AgentPeer(hello).hello, AGENT, T0)
     reject = the_answer(server)
     assert isinstance(reject, Reject)
     assert reject.reason is reason
@@ -194,43 +320,76 @@ def test_a_refusal_tells_both_sides_why(hello: Hello, reason: RejectReason, word
 def test_a_second_camera_on_a_live_slot_is_told_who_holds_it() -> None:
     server = make_server()
     joined(server)
-    hello = encode_message(make_hello(serial="S2"), 1)
-    server.receive_datagram(hello, OTHER, T0 + 700_000_000)
+    other = AgentPeer(make_hello(serial="S2"))
+    server.receive_datagram(other.hello, OTHER, T0 + 700_000_000)
     reject = the_answer(server)
     assert isinstance(reject, Reject)
     assert reject.reason is RejectReason.DUPLICATE_SLOT
     assert "serial A00362A01234047A" in reject.text
     assert "192.0.2.1:40001" in reject.text
-    server.receive_datagram(hello, OTHER, T0 + 750_000_000)
-    assert isinstance(the_answer(server), Welcome)
+    welcomed(server, other, OTHER, T0 + 750_000_000)
 
 
-def test_a_malformed_hello_is_answered_with_what_is_wrong() -> None:
+def test_who_never_confirms_does_not_push_out_the_holder_of_a_slot() -> None:
+    """Its hello came while the holder was quiet, or is a copy of the holder's own."""
     server = make_server()
-    values = {**msgpack.unpackb(HELLO[16:]), "fps": "fast"}
-    datagram = with_crc(pack_prefix(MessageType.HELLO, 0, 1) + msgpack.packb(values))
-    server.receive_datagram(datagram, AGENT, T0)
+    holder = joined_peer(server)
+    welcomed(server, AgentPeer(seed=20), OTHER, T0 + STEP_NS)
+    welcomed(server, AgentPeer(make_hello(serial="S2"), seed=21), OTHER, T0 + SECOND_NS)
+    server.handle_timeout(T0 + SECOND_NS)
+    server.receive_datagram(holder.seal(Heartbeat({"still": 1.0})), AGENT, T0 + SECOND_NS)
+    assert events_of(server) == []
+    assert server.cameras[0].health == {"still": 1.0}
+
+
+def test_of_two_agents_welcomed_to_one_slot_the_second_to_confirm_is_refused() -> None:
+    server = make_server()
+    first = welcomed(server, AgentPeer(make_hello(serial="S1"), seed=20), AGENT, T0)
+    second = welcomed(server, AgentPeer(make_hello(serial="S2"), seed=21), OTHER, T0 + STEP_NS)
+    for peer, address in ((first, AGENT), (second, OTHER)):
+        server.receive_datagram(peer.seal(Heartbeat({})), address, T0 + STEP_NS)
+    assert [event.address for event in events_of(server)] == [AGENT]
+    assert server.rejected == {"refused_duplicate_slot": 1}
+    server.receive_datagram(second.seal(Heartbeat({})), OTHER, T0 + STEP_NS)
+    assert isinstance(the_answer(server), UnknownSession)  # upon which it says hello and is told why
+
+
+def test_a_malformed_hello_of_a_holder_of_the_key_is_answered_with_what_is_wrong() -> None:
+    server = make_server()
+    values = {**msgpack.unpackb(encode_body(make_hello())[1]), "fps": "fast"}
+    server.receive_datagram(sealed_hello(msgpack.packb(values)), AGENT, T0)
     reject = the_answer(server)
     assert isinstance(reject, Reject)
     assert (reject.reason, "fps" in reject.text) == (RejectReason.MALFORMED, True)
 
 
-def test_refusals_are_reported_once_a_second_and_address_but_always_answered() -> None:
+def test_a_public_key_of_low_order_begins_no_session() -> None:
+    server = make_server()
+    server.receive_datagram(sealed_hello(encode_body(make_hello())[1], public=bytes(32)), AGENT, T0)
+    assert server.datagrams_to_send(T0) == []
+    assert server.rejected == {"malformed": 1}
+
+
+def test_refusals_are_reported_once_a_second_and_answered_ten_times_a_second_and_address() -> None:
     server = make_server(Roster())
-    for k in range(20):
-        server.receive_datagram(HELLO, AGENT, T0 + k * SECOND_NS // 10)
-    assert len(answers(server)) == 20
+    for k in range(200):
+        server.receive_datagram(HELLO, AGENT, T0 + k * SECOND_NS // 100)
+    assert len(server.datagrams_to_send(T0)) == 20
     assert len(events_of(server)) == 2
+    assert server.rejected == {"refused_unknown_camera": 200}
 
 
 def test_no_answer_to_a_stranger_is_longer_than_what_it_sent() -> None:
     server = make_server(Roster((Slot(0, "n" * 300, serial="s" * 300),)))
     text = "n" * 64
-    longest = encode_message(make_hello(name=text, serial=text, port_path=text), 1)
-    for datagram in (longest, encode_message(Goodbye(""), 9), encode_message(UnknownSession(), 9), HELLO):
-        server.receive_datagram(datagram, AGENT, T0)
+    longest = AgentPeer(make_hello(name=text, serial=text, port_path=text)).hello
+    foreign = AgentPeer(rig_key=RigKey(bytes(32))).hello
+    unknown = pack_prefix(MessageType.GOODBYE, 0, 9) + bytes(24)
+    for k, datagram in enumerate((longest, foreign, unknown, clear(UnknownSession(), 9), HELLO)):
+        server.receive_datagram(datagram, (AGENT[0], k), T0 + k * SECOND_NS)
         for answer, _ in server.datagrams_to_send(T0):
             assert len(answer) <= min(len(datagram), MIN_HELLO_SIZE)
+    assert server.rejected.total() == 5
 
 
 # ---- sessions
@@ -238,19 +397,19 @@ def test_no_answer_to_a_stranger_is_longer_than_what_it_sent() -> None:
 
 def test_an_unknown_session_is_answered_ten_times_a_second_at_most() -> None:
     server = make_server()
-    datagram = encode_message(Heartbeat({}), 99)
+    datagram = pack_prefix(MessageType.HEARTBEAT, 0, 99) + bytes(24)
     for k in range(1000):
         server.receive_datagram(datagram, AGENT, T0 + k * 1_000_000)
     notices = server.datagrams_to_send(T0)
     assert len(notices) == 10
-    assert notices[0] == (encode_message(UnknownSession(), 99), AGENT)
+    assert notices[0] == (clear(UnknownSession(), 99), AGENT)
     assert len(notices[0][0]) == 16
     assert server.rejected == {"unknown_session": 1000}
 
 
 def test_strangers_together_get_two_hundred_notices_a_second_at_most() -> None:
     server = make_server()
-    datagram = encode_message(Heartbeat({}), 99)
+    datagram = pack_prefix(MessageType.HEARTBEAT, 0, 99) + bytes(24)
     for k in range(10_000):
         server.receive_datagram(datagram, ("198.51.100.1", k), T0 + k * 100_000)
     assert len(server.datagrams_to_send(T0)) == 200
@@ -258,17 +417,95 @@ def test_strangers_together_get_two_hundred_notices_a_second_at_most() -> None:
 
 def test_a_session_is_bound_to_its_address() -> None:
     server = make_server()
-    agent = joined(server)
-    server.receive_datagram(encode_message(Goodbye(""), session_id(agent)), OTHER, T0)
+    peer = welcomed(server, AgentPeer())
+    server.receive_datagram(peer.seal(Heartbeat({})), OTHER, T0)
+    assert events_of(server) == []
+    server.receive_datagram(peer.seal(Heartbeat({})), AGENT, T0)
+    server.receive_datagram(peer.seal(Goodbye("")), OTHER, T0)
     assert server.cameras[0].connected
-    assert server.rejected == {"wrong_address": 1}
-    assert answers(server) == []
+    assert server.rejected == {"wrong_address": 2}
+    assert server.datagrams_to_send(T0) == []
+
+
+@pytest.mark.parametrize(
+    ("harm", "cause"),
+    [
+        (lambda d: d, "replayed"),
+        (lambda d: d[:16] + b"\x09" + d[17:], "bad_seal"),
+        (lambda d: d[:3] + bytes([MessageType.GOODBYE]) + d[4:16] + b"\x09" + d[17:], "bad_seal"),
+        (lambda d: d[:30], "malformed"),
+        (lambda d: d.ljust(1201, b"\0"), "malformed"),
+    ],
+    ids=["the same again", "another counter", "another type", "cut", "too long"],
+)
+def test_an_altered_or_repeated_message_changes_nothing(harm: Callable[[bytes], bytes], cause: str) -> None:
+    server = make_server()
+    peer = joined_peer(server)
+    datagram = peer.seal(Heartbeat({"t": 1.0}))
+    server.receive_datagram(datagram, AGENT, T0)
+    server.receive_datagram(harm(datagram), AGENT, T0 + SECOND_NS)
+    assert server.rejected == {cause: 1}
+    if cause != "malformed":
+        assert getattr(server.cameras[0].counters, cause) == 1
+    server.handle_timeout(T0 + 2 * SECOND_NS)  # nor does it keep the session alive
+    assert events_of(server) == [CameraLeft(0, "silent for 2.0 s")]
+
+
+def test_a_message_of_one_session_is_not_accepted_in_another() -> None:
+    server = make_server()
+    first = joined_peer(server, seed=8)
+    second = joined_peer(server, OTHER, T0 + STEP_NS, seed=9, camera_id=1, serial="S1")
+    stolen = bytearray(first.seal(Goodbye("")))
+    stolen[8:16] = second.seal(Heartbeat({}))[8:16]
+    server.receive_datagram(bytes(stolen), OTHER, T0)
+    assert server.rejected == {"bad_seal": 1}
+    assert server.cameras[1].connected
+
+
+def test_a_frame_of_one_session_is_not_accepted_in_another() -> None:
+    server = make_server()
+    first = joined_peer(server, seed=8)
+    second = joined_peer(server, OTHER, T0 + STEP_NS, seed=9, camera_id=1, serial="S1")
+    session = second.seal(Heartbeat({}))[8:16]
+    for datagram in first.fragments(make_frame(timestamp_ns=T0), 0):
+        moved = bytearray(datagram)
+        moved[8:16] = session
+        server.receive_datagram(bytes(moved), OTHER, T0)
+    assert events_of(server) == []
+    assert server.cameras[1].counters.corrupt == 1
+
+
+def test_what_the_server_said_is_not_accepted_back_from_it() -> None:
+    server = make_server()
+    peer = joined_peer(server)
+    server.close(T0)  # a goodbye: the one type that both ends send
+    [(goodbye, _)] = server.datagrams_to_send(T0)
+    assert peer.read([goodbye]) == [Goodbye("the server stops")]
+    again = make_server()
+    same = joined_peer(again)  # the same seeds: the same session and keys
+    again.receive_datagram(goodbye, AGENT, T0)
+    assert again.rejected == {"replayed": 1}  # by its counter, 0; under another one:
+    again.receive_datagram(goodbye[:16] + b"\x07" + goodbye[17:], AGENT, T0)
+    assert again.rejected == {"replayed": 1, "bad_seal": 1}
+    again.receive_datagram(same.seal(Heartbeat({"still": 1.0})), AGENT, T0)
+    assert again.cameras[0].health == {"still": 1.0}
+
+
+def test_messages_that_overtook_each_other_are_all_taken() -> None:
+    server = make_server()
+    peer = joined_peer(server)
+    datagrams = [peer.seal(Heartbeat({"k": float(k)})) for k in range(20)]
+    seen = []
+    for datagram in reversed(datagrams):
+        server.receive_datagram(datagram, AGENT, T0)
+        seen.append(server.cameras[0].health["k"])
+    assert seen == list(range(19, -1, -1))
 
 
 def test_a_silent_agent_leaves_after_two_seconds() -> None:
     server = make_server()
-    agent = joined(server)
-    server.receive_datagram(encode_message(Heartbeat({}), session_id(agent)), AGENT, T0 + SECOND_NS)
+    peer = joined_peer(server)
+    server.receive_datagram(peer.seal(Heartbeat({})), AGENT, T0 + SECOND_NS)
     server.handle_timeout(T0 + 3 * SECOND_NS - 1)
     assert events_of(server) == []
     server.handle_timeout(T0 + 3 * SECOND_NS)
@@ -279,38 +516,81 @@ def test_a_silent_agent_leaves_after_two_seconds() -> None:
 
 def test_a_goodbye_ends_the_session_with_its_text() -> None:
     server = make_server()
-    agent = joined(server)
-    server.receive_datagram(encode_message(Goodbye("device lost"), session_id(agent)), AGENT, T0)
+    server.receive_datagram(joined_peer(server).seal(Goodbye("device lost")), AGENT, T0)
     assert events_of(server) == [CameraLeft(0, "goodbye: device lost")]
 
 
 def test_closing_says_goodbye_to_all_and_welcomes_nobody_after() -> None:
     server = make_server()
-    agent = joined(server)
+    peer = joined_peer(server)
+    waiting = welcomed(server, AgentPeer(make_hello(camera_id=3, serial="S3"), seed=9), OTHER, T0 + STEP_NS)
     server.close(T0)
-    assert answers(server) == [(Goodbye("the server stops"), AGENT)]
-    server.receive_datagram(encode_message(make_hello(), 9), AGENT, T0)
-    assert answers(server) == []
-    assert agent.connected  # until it hears the goodbye
+    assert peer.read(datagram for datagram, _ in server.datagrams_to_send(T0)) == [
+        Goodbye("the server stops")
+    ]
+    events_of(server)
+    server.receive_datagram(AgentPeer(seed=9).hello, AGENT, T0)
+    assert server.datagrams_to_send(T0) == []
     assert server.rejected == {"closed": 1}
-
-
-def test_health_reaches_the_status() -> None:
-    server = make_server()
-    agent = joined(server)
-    server.receive_datagram(encode_message(Heartbeat({"temperature_c": 60.0}), session_id(agent)), AGENT, T0)
-    assert server.cameras[0].health == {"temperature_c": 60.0}
+    server.receive_datagram(waiting.seal(Heartbeat({})), OTHER, T0)
+    assert events_of(server) == []
 
 
 def test_an_unnamed_camera_of_an_open_roster_gets_its_old_id_back() -> None:
     server = make_server()
-    joined(server, make_hello(camera_id=None, serial="S0"), seed=10, address=("192.0.2.9", 1))
-    agent = joined(server, make_hello(camera_id=None, serial="S1"), seed=11, address=("192.0.2.9", 2))
-    assert agent.session is not None
-    assert agent.session.camera_id == 1
-    again = joined(server, make_hello(camera_id=None, serial="S1"), seed=12, address=("192.0.2.9", 3))
-    assert again.session is not None
-    assert again.session.camera_id == 1
+    ids = []
+    for k, serial in enumerate(("S0", "S1", "S1")):
+        hello = make_hello(camera_id=None, serial=serial)
+        agent = joined(server, hello, 10 + k, ("192.0.2.9", k), T0 + k * STEP_NS)
+        assert agent.session is not None
+        ids.append(agent.session.camera_id)
+    assert ids == [0, 1, 1]
+
+
+# ---- stream plans
+
+
+CHOICE = StreamChoice(COLOR, None, 15.0, step_ns=1_000_000, slot=3, slots=12)
+
+
+def plans_of(server: ServerLink, peer: AgentPeer, now_ns: int) -> list[StreamPlan]:
+    server.handle_timeout(now_ns)
+    messages = peer.read(datagram for datagram, _ in server.datagrams_to_send(now_ns))
+    requests = [message for message in messages if isinstance(message, ClockRequest)]
+    for request in requests:  # an agent whose clock is 5 s and 123,456 ns behind, without any delay
+        t2_ns = now_ns - 5_000_123_456
+        server.receive_datagram(peer.seal(ClockReply(request.t1_ns, t2_ns, t2_ns)), AGENT, now_ns)
+    return [message for message in messages if isinstance(message, StreamPlan)]
+
+
+def test_a_plan_comes_with_every_clock_request_once_the_clock_is_known() -> None:
+    server = make_server()
+    peer = joined_peer(server)
+    assert plans_of(server, peer, T0) == []
+    server.plan_stream(0, CHOICE)
+    plans = [plans_of(server, peer, T0 + k * SECOND_NS // 2) for k in range(1, 4)]
+    # Rig time 0.25 ms past a step, in the agent's clock.
+    assert plans == [[StreamPlan(COLOR, None, 15.0, 1_000_000, (250_000 - 123_456) % 1_000_000)]] * 3
+
+
+def test_a_plan_is_for_the_session_that_it_was_made_for() -> None:
+    server = make_server()
+    server.plan_stream(0, CHOICE)  # nobody is there: nothing to tell
+    peer = joined_peer(server)
+    assert plans_of(server, peer, T0) == []
+    assert plans_of(server, peer, T0 + SECOND_NS) == []
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [{"fps": 0.0}, {"step_ns": 0}, {"slots": 0}, {"slot": 12}, {"slot": -1}, {"color_codec": 0}],
+    ids=str,
+)
+def test_a_choice_that_no_plan_can_tell_is_misuse_at_once(changes: dict[str, Any]) -> None:
+    server = make_server()
+    joined_peer(server)
+    with pytest.raises(LinkUsageError):
+        server.plan_stream(0, replace(CHOICE, **changes))
 
 
 # ---- frames
@@ -331,13 +611,22 @@ def test_a_frame_leaves_in_rig_time_with_both_uncertainties() -> None:
 
 
 def test_a_frame_before_the_first_clock_exchange_is_untimed() -> None:
-    server, agent = make_server(), make_agent()
-    [hello] = agent.datagrams_to_send(T0)
-    server.receive_datagram(hello, AGENT, T0)
-    agent.receive_datagram(server.datagrams_to_send(T0)[0][0], T0)
-    deliver(server, agent)
-    assert [type(event) for event in events_of(server)] == [CameraJoined]
+    server = make_server()
+    peer = joined_peer(server)
+    server.receive_batch(peer.fragments(make_frame(timestamp_ns=T0), 0), AGENT, T0)
+    assert events_of(server) == []
     assert server.cameras[0].counters.untimed == 1
+
+
+def test_a_frame_tells_when_its_last_datagram_was_here() -> None:
+    server = make_server()
+    agent = joined(server)
+    batch = agent.send_frame(make_frame(timestamp_ns=T0), T0)
+    assert batch is not None
+    for k, datagram in enumerate(batch):
+        server.receive_datagram(datagram, AGENT, T0 + k * 1_000_000)
+    [event] = events_of(server)
+    assert event.frame.received_ns == T0 + (len(batch) - 1) * 1_000_000
 
 
 @pytest.mark.parametrize("stamp_ns", [T0 + SECOND_NS, T0 - 11 * SECOND_NS, -(2**63), 2**63 - 1])
@@ -346,13 +635,24 @@ def test_a_frame_from_the_future_or_long_ago_is_untimed_and_the_clock_is_asked_s
 ) -> None:
     server = make_server()
     agent = joined(server)
-    server.datagrams_to_send(T0 + SECOND_NS // 2)
-    batch = agent.send_frame(make_frame(timestamp_ns=stamp_ns), T0)
+    now_ns = T0
+    for _ in range(10):  # the quick exchanges of the beginning
+        due_ns = server.next_timeout_ns()
+        assert due_ns is not None
+        now_ns = max(now_ns, due_ns)
+        roundtrip(agent, server, AGENT, now_ns)
+    server.handle_timeout(now_ns)
+    assert server.next_timeout_ns() == now_ns + SECOND_NS // 4
+    batch = agent.send_frame(make_frame(timestamp_ns=stamp_ns), now_ns)
     assert batch is not None
-    server.receive_batch(batch, AGENT, T0)
+    server.receive_batch(batch, AGENT, now_ns)
     assert events_of(server) == []
     assert server.cameras[0].counters.untimed == 1
-    assert server.datagrams_to_send(T0 + SECOND_NS // 2 + 20_000_000) != []
+    asked_at = []
+    for later_ns in (19_999_999, 20_000_000):
+        server.handle_timeout(now_ns + later_ns)
+        asked_at += [later_ns for _ in server.datagrams_to_send(now_ns + later_ns)]
+    assert asked_at == [20_000_000]
 
 
 def test_a_damaged_frame_is_delivered_flagged_and_counted() -> None:
@@ -363,14 +663,22 @@ def test_a_damaged_frame_is_delivered_flagged_and_counted() -> None:
     assert server.cameras[0].counters.damaged == 1
 
 
-def test_a_frame_in_a_codec_that_was_not_chosen_is_refused() -> None:
-    server = make_server(color_codecs=(COLOR, COLOR + 1))
-    agent = joined(server)
-    assert agent.session is not None
-    object.__setattr__(agent.session, "color_codec", COLOR + 1)  # an agent that does not keep to the welcome
-    deliver(server, agent, color=Payload(COLOR + 1, b"x"))
+def test_a_frame_in_a_codec_that_was_not_welcomed_is_refused() -> None:
+    server = make_server()
+    peer = joined_peer(server)
+    frame = make_frame(timestamp_ns=T0, color=Payload(COLOR + 1, b"x"))
+    server.receive_batch(peer.fragments(frame, 0), AGENT, T0)
     assert events_of(server) == []
     assert server.cameras[0].counters.unexpected_codec == 1
+
+
+def test_a_change_of_codec_amid_the_session_loses_no_frame_not_even_one_under_way() -> None:
+    server = make_server(color_codecs=(COLOR, COLOR + 1))
+    agent = joined(server, make_hello(color_codecs=(COLOR, COLOR + 1)))
+    server.plan_stream(0, replace(CHOICE, color_codec=COLOR + 1))
+    for k, codec_id in enumerate((COLOR, COLOR + 1, COLOR, COLOR + 1)):
+        deliver(server, agent, sequence=k, color=Payload(codec_id, b"x"))
+    assert [event.frame.sequence for event in events_of(server)] == [0, 1, 2, 3]
 
 
 def test_frames_that_nobody_fetches_are_bounded_and_the_oldest_goes() -> None:
@@ -386,13 +694,13 @@ def test_frames_that_nobody_fetches_are_bounded_and_the_oldest_goes() -> None:
 def test_a_batch_may_mix_fragments_control_and_garbage() -> None:
     server = make_server()
     agent = joined(server)
-    batch = agent.send_frame(make_frame(timestamp_ns=T0, size=1408), T0)
+    batch = agent.send_frame(make_frame(timestamp_ns=T0, size=1392), T0)
     assert batch is not None
-    heartbeat = encode_message(Heartbeat({"t": 1.0}), session_id(agent)).ljust(1472, b"\0")
+    heartbeat = pack_prefix(MessageType.HEARTBEAT, 0, session_id(agent)).ljust(1472, b"\0")
     content = heartbeat + bytes(batch.buffer) + b"\xff" * 1472 + b"KR"
     server.receive_batch(DatagramBatch(content, 1472), AGENT, T0)
     assert [type(event) for event in events_of(server)] == [FrameReceived]
-    assert server.rejected == {"corrupt_control": 1, "bad_magic": 1, "too_short": 1}
+    assert server.rejected == {"malformed": 1, "bad_magic": 1, "too_short": 1}
 
 
 @pytest.mark.parametrize(
@@ -401,16 +709,15 @@ def test_a_batch_may_mix_fragments_control_and_garbage() -> None:
         (b"", "too_short"),
         (bytes(15), "too_short"),
         (bytes(16), "bad_magic"),
-        (MAGIC + bytes((2, MessageType.FRAGMENT)) + bytes(60), "other_version"),
-        (MAGIC + bytes((1, 99)) + bytes(12), "unknown_type"),
-        (encode_message(ClockRequest(1), 5), "unexpected_type"),
-        (encode_message(Reject(RejectReason.OTHER, "x"), 5), "unexpected_type"),
-        (encode_message(Goodbye("x"), 5)[:-1], "corrupt_control"),
+        (MAGIC + bytes((1, MessageType.FRAGMENT)) + bytes(60), "other_version"),
+        (MAGIC + bytes((2, 99)) + bytes(12), "unknown_type"),
+        (clear(ClockRequest(1), 5), "unexpected_type"),
+        (clear(Reject(RejectReason.OTHER, "x"), 5), "unexpected_type"),
         (HELLO[:-1], "corrupt_control"),
         (HELLO[:511], "malformed"),
-        (encode_message(make_hello(), 0), "malformed"),
-        (MAGIC + bytes((1, MessageType.FRAGMENT)) + bytes(12), "bad_fragment"),
-        (MAGIC + bytes((1, MessageType.FRAGMENT)) + bytes(60), "bad_fragment"),
+        (sealed_hello(encode_body(make_hello())[1], nonce=0), "malformed"),
+        (MAGIC + bytes((2, MessageType.FRAGMENT)) + bytes(12), "bad_fragment"),
+        (MAGIC + bytes((2, MessageType.FRAGMENT)) + bytes(60), "bad_fragment"),
     ],
 )
 def test_an_unexpected_datagram_is_dropped_counted_and_not_answered(datagram: bytes, cause: str) -> None:
@@ -424,26 +731,26 @@ def test_an_unexpected_datagram_is_dropped_counted_and_not_answered(datagram: by
 @pytest.mark.parametrize("body", [b"", b"\x80", b"\xff" * 8, b"\x81\xa6health\xc0"])
 def test_a_malformed_message_of_a_session_is_counted(body: bytes) -> None:
     server = make_server()
-    agent = joined(server)
-    server.receive_datagram(
-        with_crc(pack_prefix(MessageType.HEARTBEAT, 0, session_id(agent)) + body), AGENT, T0
-    )
+    peer = joined_peer(server)
+    server.receive_datagram(peer.seal_body(MessageType.HEARTBEAT, body), AGENT, T0)
     assert server.rejected == {"malformed": 1}
 
 
 def test_a_clock_reply_without_its_request_is_counted() -> None:
     server = make_server()
-    agent = joined(server)
-    server.receive_datagram(encode_message(ClockReply(1, 2, 3), session_id(agent)), AGENT, T0)
+    server.receive_datagram(joined_peer(server).seal(ClockReply(1, 2, 3)), AGENT, T0)
     assert server.cameras[0].counters.bad_clock_reply == 1
 
 
 @pytest.mark.parametrize("kind", [bytes, bytearray, memoryview])
 def test_datagrams_may_be_any_bytes_like_object(kind: type) -> None:
-    server = make_server()
-    datagram: Buffer = kind(HELLO)
+    server, peer = make_server(), AgentPeer()
+    datagram: Buffer = kind(peer.hello)
     server.receive_datagram(datagram, AGENT, T0)
-    assert isinstance(the_answer(server), Welcome)
+    peer.accept(server.datagrams_to_send(T0)[0][0])
+    datagram = kind(peer.seal(Heartbeat({})))
+    server.receive_datagram(datagram, AGENT, T0)
+    assert [type(event) for event in events_of(server)] == [CameraJoined]
 
 
 @pytest.mark.parametrize("size", [1199, 65508])

@@ -11,6 +11,7 @@ from pathlib import Path
 
 import pytest
 
+from rig_protocol.key_file import read_key
 from rig_server.cli import main
 from rig_server.config import RigSettings, load_rig_settings
 
@@ -19,8 +20,10 @@ Program = Callable[..., int]
 
 @pytest.fixture
 def rig_server(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Program]:
-    """Run the program in this process, in an empty folder; its exit status."""
+    """Run the program in this process, in an empty folder and without a key; its exit status."""
     monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("rig_protocol.key_file.KEY_PLACES", (Path("rig.key"),))
+    (tmp_path / "with-key.toml").write_text('key_file = "rig.key"')
     handler = signal.getsignal(signal.SIGTERM)
 
     def run(*words: str) -> int:
@@ -46,6 +49,38 @@ def test_init_writes_a_file_that_changes_nothing_and_overwrites_only_by_force(
     assert load_rig_settings(tmp_path / "rig.toml") == RigSettings()
 
 
+def test_keygen_makes_a_key_that_only_its_owner_reads_and_replaces_one_only_by_force(
+    rig_server: Program, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert rig_server("keygen") == 0
+    assert "wrote rig.key (mode 0600)" in capsys.readouterr().out
+    first = read_key(tmp_path / "rig.key")
+    assert not first.is_public
+    assert rig_server("keygen") == 2
+    assert "rig.key exists" in capsys.readouterr().err
+    assert read_key(tmp_path / "rig.key") == first
+    assert rig_server("keygen", "--force") == 0
+    assert read_key(tmp_path / "rig.key") != first
+    assert rig_server("keygen", "--path", "other.key") == 0
+    assert read_key(tmp_path / "other.key") != read_key(tmp_path / "rig.key")
+    assert "other.key" in capsys.readouterr().out
+
+
+def test_the_key_itself_is_never_printed(
+    rig_server: Program, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    rig_server("keygen")
+    shown = capsys.readouterr()
+    assert (tmp_path / "rig.key").read_text().split()[1] not in shown.out + shown.err
+
+
+def test_an_insecure_server_says_so_loudly(
+    rig_server: Program, capsys: pytest.CaptureFixture[str], caplog: pytest.LogCaptureFixture
+) -> None:
+    rig_server("--listen", "192.0.2.1:0", "--insecure")
+    assert "INSECURE: anybody on this network" in caplog.text + capsys.readouterr().err
+
+
 def test_help_teaches_with_examples(rig_server: Program, capsys: pytest.CaptureFixture[str]) -> None:
     assert rig_server("--help") == 0
     shown = capsys.readouterr().out
@@ -61,9 +96,11 @@ def test_help_teaches_with_examples(rig_server: Program, capsys: pytest.CaptureF
         (["--simulate", "2", "--listen", ":0"], "--listen has no effect with --simulate"),
         (["--calibrate", "--method", "magic"], "calibration.method"),
         (["--config", "absent.toml"], "absent.toml cannot be read"),
-        (["--listen", "192.0.2.1:0"], "no interface of this machine has address 192.0.2.1"),
+        (["--listen", "192.0.2.1:0", "--insecure"], "no interface of this machine has address 192.0.2.1"),
         (["--simulate", "0"], "--simulate"),
         (["--calibrate", "--out", "/proc/no"], "cannot write to /proc/no"),
+        ([], "run `rig-server keygen` on the PC"),
+        (["--insecure", "--config", "with-key.toml"], "drop one"),
     ],
 )
 def test_wrong_usage_ends_with_status_2_and_says_why(
@@ -79,7 +116,7 @@ def test_a_port_in_use_ends_with_status_1_and_says_what_to_do(
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as other:
         other.bind(("127.0.0.1", 0))
         port = other.getsockname()[1]
-        assert rig_server("--listen", f"127.0.0.1:{port}") == 1
+        assert rig_server("--listen", f"127.0.0.1:{port}", "--insecure") == 1
     assert f"UDP port {port} is in use" in capsys.readouterr().err
 
 
@@ -88,7 +125,7 @@ def test_cameras_that_do_not_come_end_the_calibration_with_status_1_and_their_na
 ) -> None:
     cameras = "[[cameras]]\nid = 0\nname = 'door'\n[[cameras]]\nid = 1\n"
     (tmp_path / "rig.toml").write_text(f"listen = '127.0.0.1:0'\n[capture]\nwait_s = 0.5\n{cameras}")
-    assert rig_server("--calibrate") == 1
+    assert rig_server("--calibrate", "--insecure") == 1
     assert "2 of 2 cameras have not come: door, cam01" in capsys.readouterr().err
 
 
@@ -117,7 +154,7 @@ def test_budget_ends_with_status_1_when_nothing_fits_and_2_for_a_link_that_canno
 
 def test_a_running_server_ends_with_status_0_when_told_to_stop(tmp_path: Path) -> None:
     with subprocess.Popen(
-        [sys.executable, "-m", "rig_server.cli", "--listen", "127.0.0.1:0"],
+        [sys.executable, "-m", "rig_server.cli", "--listen", "127.0.0.1:0", "--insecure"],
         cwd=tmp_path,
         stdout=subprocess.PIPE,
         text=True,

@@ -15,7 +15,10 @@ from support.garbage import send_garbage
 from support.small_agent import BAYER, FPS, RAW, SmallAgent
 
 LOOPBACK = RigSettings(
-    listen="127.0.0.1:0", expected_cameras=3, synchroniser=SynchroniserSettings(deadline_ms=500)
+    listen="127.0.0.1:0",
+    insecure=True,
+    expected_cameras=3,
+    synchroniser=SynchroniserSettings(deadline_ms=500),
 )
 
 

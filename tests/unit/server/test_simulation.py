@@ -12,11 +12,13 @@ from rig_protocol.errors import RigError
 from rig_server import Rig
 from rig_server.config import CameraSettings, RigSettings, RingSettings
 from rig_server.simulation import Simulation, simulated_settings
+from support.wire import KEY
 
 START_AND_TELL = """
 import sys, time
+from rig_protocol.rig_key import RigKey
 from rig_server.simulation import Simulation
-simulation = Simulation(2, 0, 5.0, ("127.0.0.1", 9))
+simulation = Simulation(2, 0, 5.0, ("127.0.0.1", 9), RigKey.INSECURE)
 simulation.start()
 print(*(agent.pid for agent in simulation._agents.values()), flush=True)
 time.sleep(60)
@@ -47,7 +49,7 @@ def test_simulated_cameras_come_with_the_drawing_of_their_ring_and_the_truth() -
 
 
 def test_an_agent_that_dies_ends_the_run_with_its_log() -> None:
-    simulation = Simulation(1, -1, 5.0, ("127.0.0.1", 9))  # a seed that the agent refuses
+    simulation = Simulation(1, -1, 5.0, ("127.0.0.1", 9), KEY)  # a seed that the agent refuses
     simulation.start()
     try:
         simulation._agents[0].wait(30)
@@ -58,7 +60,7 @@ def test_an_agent_that_dies_ends_the_run_with_its_log() -> None:
 
 
 def test_closing_ends_every_agent_and_is_harmless_twice() -> None:
-    simulation = Simulation(2, 0, 5.0, ("127.0.0.1", 9))
+    simulation = Simulation(2, 0, 5.0, ("127.0.0.1", 9), KEY)
     simulation.start()
     pids = [agent.pid for agent in simulation._agents.values()]
     simulation.close()
