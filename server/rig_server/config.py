@@ -13,6 +13,7 @@ from rig_protocol.errors import ConfigurationError, DataError
 from rig_protocol.events import Address
 from rig_protocol.rig_folder import RingDrawing, read_json
 from rig_protocol.settings import Settings, load_settings
+from rig_server.synchroniser import Policy
 
 ENVIRONMENT_PREFIX = "RIG_SERVER_"
 CONFIG_PLACES = (Path("rig.toml"), Path("/etc/kinect-rig/rig.toml"))
@@ -61,10 +62,15 @@ class CameraSettings(Settings):
 class SynchroniserSettings(Settings):
     """How frames of free-running cameras are grouped into panoramic frames."""
 
+    policy: Policy = "partial"
+    """`partial`: a set waits for every camera of which a frame is due, up to its deadline. `strict`: only
+    complete sets, at the rate of the slowest camera. `latest`: sets wait one frame period at most; a camera
+    without a new frame repeats its last."""
     max_spread_ms: float | None = Field(None, gt=0, examples=[33.3])
-    """Widest exposure spread of a set; unset: one frame period of the cameras."""
+    """Widest exposure spread of a set; unset: one frame period (`latest`: 1.5 of the slowest camera's)."""
     deadline_ms: float = Field(100.0, gt=0, le=10_000)
-    """How long after one frame period a set waits for a frame that is late before it goes out partial."""
+    """How long after one frame period a set waits for a frame that is late before it goes out partial, or is
+    dropped if `strict`. Not used by `latest`."""
 
 
 class LinkSettings(Settings):

@@ -1,11 +1,12 @@
 """What the operator is told of the running rig: one line a camera, and the sets."""
 
 import statistics
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 from rig_server.assembler import SetRecord
+from rig_server.synchroniser import IncompleteSet
 
 TEMPERATURE = "temperature_c"  # the gauge of an agent's heartbeat that has a column of its own
 _RATE_WINDOW_NS = 3_000_000_000
@@ -75,14 +76,26 @@ class RateMeter:
         return (last - first) * 1e9 / (end_ns - start_ns) if end_ns > start_ns else 0.0
 
 
-def summarise_sets(recent: Sequence[SetRecord], now_ns: int) -> tuple[float, float | None, tuple[int, ...]]:
-    """Sets a second, median spread in ms, and the cameras missing from at least a tenth, worst first."""
-    fresh = [record for record in recent if record.delivered_ns >= now_ns - _RATE_WINDOW_NS]
+def summarise_sets(
+    recent: Sequence[SetRecord], now_ns: int, incomplete: Sequence[IncompleteSet] = ()
+) -> tuple[float, float | None, tuple[int, ...]]:
+    """Sets a second, median spread in ms, and the cameras missing from at least a tenth, worst first.
+
+    `incomplete`: sets that did not go out; their cameras are named too.
+    """
+    since_ns = now_ns - _RATE_WINDOW_NS
+    fresh = [record for record in recent if record.delivered_ns >= since_ns]
+    lacking = [record.missing for record in fresh]
+    lacking += [record.missing for record in incomplete if record.decided_ns >= since_ns]
+    ranked = _often_missing(lacking)
     if not fresh:
-        return 0.0, None, ()
+        return 0.0, None, ranked
     elapsed_ns = max(now_ns - fresh[0].delivered_ns, 1)
     rate = (len(fresh) - 1) * 1e9 / elapsed_ns
-    absent = [camera_id for record in fresh for camera_id in record.missing]
-    often = {camera_id for camera_id in absent if 10 * absent.count(camera_id) >= len(fresh)}
-    ranked = sorted(often, key=lambda camera_id: (-absent.count(camera_id), camera_id))
-    return rate, statistics.median(record.spread_ns for record in fresh) / 1e6, tuple(ranked)
+    return rate, statistics.median(record.spread_ns for record in fresh) / 1e6, ranked
+
+
+def _often_missing(lacking: Sequence[tuple[int, ...]]) -> tuple[int, ...]:
+    absent = Counter(camera_id for missing in lacking for camera_id in missing)
+    often = [camera_id for camera_id, count in absent.items() if 10 * count >= len(lacking)]
+    return tuple(sorted(often, key=lambda camera_id: (-absent[camera_id], camera_id)))

@@ -128,7 +128,9 @@ class LivePipeline:
         cameras = dict(self._link.cameras)
         rates = self._rates.update({i: camera.counters.frames for i, camera in cameras.items()}, now_ns)
         names = camera_names(self._settings, self.hellos)
-        sets_per_s, spread_ms, often_missing = summarise_sets(self._assembler.recent, now_ns)
+        sets_per_s, spread_ms, often_missing = summarise_sets(
+            self._assembler.recent, now_ns, self._assembler.recent_incomplete
+        )
         return RigStatus(
             cameras=tuple(
                 self._metrics(camera_id, name, cameras.get(camera_id), rates.get(camera_id, 0.0))
@@ -192,6 +194,7 @@ class LivePipeline:
 
     def _dropped(self) -> dict[str, int]:
         return {
+            "incomplete sets": self._assembler.incomplete,
             "sets not taken": self._assembler.overrun,
             "frames left out of sets": self._assembler.skipped,
             "frames of implausible time": self._assembler.implausible,
@@ -208,6 +211,7 @@ def _synchroniser(settings: RigSettings) -> Synchroniser:
         (camera.id for camera in settings.cameras),
         deadline_ns=int(options.deadline_ms * 1e6),
         max_spread_ns=None if options.max_spread_ms is None else int(options.max_spread_ms * 1e6),
+        policy=options.policy,
     )
 
 

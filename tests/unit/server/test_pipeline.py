@@ -100,6 +100,7 @@ def test_waiting_for_cameras_ends_at_once_when_receiving_has_failed(
 
 def test_everything_that_is_lost_on_the_way_has_a_name(rig: Rig) -> None:
     assert rig.status().dropped == {
+        "incomplete sets": 0,
         "sets not taken": 0,
         "frames left out of sets": 0,
         "frames of implausible time": 0,
