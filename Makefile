@@ -3,8 +3,9 @@ PYTHON ?= python3
 VENV   := .venv
 BIN    := $(VENV)/bin
 READY  := $(VENV)/.ready
+BENCH  := $(VENV)/.ready-bench
 
-.PHONY: demo test lint bench-codecs soak fuzz docs clean
+.PHONY: demo test lint bench bench-codecs bench-transport soak fuzz docs clean
 
 demo: $(READY)  ## twelve simulated Kinects over loopback UDP, calibrated and fused into build/demo
 	$(BIN)/rig-server --calibrate --simulate 12 --frames 5 --out build/demo
@@ -29,6 +30,11 @@ fuzz: $(VENV)/.ready-fuzz  ## every parser of strangers' bytes, 100 s each: FUZZ
 	    $(BIN)/python tests/fuzz/fuzz_parsers.py $$target -max_total_time=$(or $(FUZZ_SECONDS),100) || exit 1; \
 	done
 
+bench-transport: $(BENCH)  ## the transport against its bars and its peers, into docs/performance.md
+	$(BIN)/python tests/benchmarks/bench_transport.py
+
+bench: bench-codecs bench-transport  ## all figures, into build/bench.json
+
 docs: $(READY)  ## the pages that are made from the code
 	$(BIN)/python docs/generate_configuration.py
 
@@ -44,4 +50,8 @@ $(READY): pyproject.toml requirements.lock
 	$(PYTHON) -m venv $(VENV)
 	$(BIN)/python -m pip install --quiet --upgrade pip
 	$(BIN)/python -m pip install --quiet --constraint requirements.lock --editable '.[dev]'
+	touch $@
+
+$(BENCH): $(READY)
+	$(BIN)/python -m pip install --quiet --constraint requirements.lock --editable '.[bench]'
 	touch $@

@@ -28,7 +28,8 @@ NO_DEPTH_MM = 0
 class RgbdFrame:
     """One camera's colour and depth of one instant.
 
-    Colour is either `bayer` (H,W) u8, GRBG, or `color` (H,W,3) BGR or (H,W) grey u8.
+    Colour is either `bayer` (H,W) u8, GRBG, or `color` (H,W,3) BGR or (H,W) grey u8; a server that was
+    asked to demosaic gives both.
     Depth is either `raw` (H,W) u16 11-bit disparity, 2047 = none, or `depth_mm` (H,W) u16, 0 = none.
     `received_ns`: rig time at which its last datagram was here; None where it crossed no network.
     """

@@ -29,12 +29,11 @@ class Pending(NamedTuple):
 
 
 class Head(NamedTuple):
-    """The next exposure of a camera that a set may take, and the one after it; are their frames here?"""
+    """The next exposure of a camera that a set may take, its frame here or not, and the one after it."""
 
     exposure_ns: int
     here: bool
     following_ns: int
-    following_here: bool
     queue: "CameraQueue"
 
 
@@ -106,22 +105,23 @@ class CameraQueue:
         if not self.pending:
             if expected_ns is None:
                 return None
-            return Head(expected_ns, False, expected_ns + period_ns, False, self)
+            return Head(expected_ns, False, expected_ns + period_ns, self)
         first_ns = self.pending[0].frame.timestamp_ns
         if expected_ns is not None and expected_ns < first_ns - period_ns // 2:
             # Frames are missing before the first one here, which tells the phase better.
             ahead = min(round((first_ns - expected_ns) / period_ns), (first_ns - earliest_ns) // period_ns)
             if ahead > 0:
                 expected_ns = first_ns - ahead * period_ns
-                return Head(expected_ns, False, expected_ns + period_ns, ahead == 1, self)
+                return Head(expected_ns, False, expected_ns + period_ns, self)
         return self.real_head()
 
     def real_head(self) -> Head:
         """The first frame that is here; there must be one."""
         first_ns = self.pending[0].frame.timestamp_ns
+        following_ns = first_ns + self.rate.period_ns
         if len(self.pending) > 1:
-            return Head(first_ns, True, self.pending[1].frame.timestamp_ns, True, self)
-        return Head(first_ns, True, first_ns + self.rate.period_ns, False, self)
+            following_ns = self.pending[1].frame.timestamp_ns
+        return Head(first_ns, True, following_ns, self)
 
     def pop(self) -> RgbdFrame:
         """The first frame that waits; no older one is taken from now on."""

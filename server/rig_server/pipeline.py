@@ -72,7 +72,9 @@ class LivePipeline:
             on_turn=self._streams.turn,
         )
         # After the port is ours: its first construction on a machine compiles for seconds.
-        self._decoder = FrameDecoder(self._on_frame, threads=settings.decoder_threads)
+        self._decoder = FrameDecoder(
+            self._on_frame, threads=settings.decoder_threads, demosaic=settings.demosaic
+        )
         self._status = StatusReader(
             settings,
             self._link,

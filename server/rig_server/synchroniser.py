@@ -94,6 +94,7 @@ class Synchroniser:
     def camera_left(self, camera_id: int) -> None:
         """Sets no longer wait for this camera; an expected one is named missing."""
         self._queues[camera_id].leave()
+        self._policy.settle()
         self._stirred = True
 
     def late(self, camera_id: int) -> int:

@@ -3,7 +3,7 @@
 Marked on a circle one period round, the exposures of free-running cameras leave gaps; the tightest set
 starts after the widest gap. The next exposure of each camera (its head: a frame that waits, or one that is
 expected) is a candidate; where starting a frame later for the earliest cameras would be tighter by more
-than the hysteresis, the cut moves there. That is also how a set follows a camera that slides by a frame, at
+than that costs, the cut moves there. That is also how a set follows a camera that slides by a frame, at
 the price of one frame of that camera, and why a slow camera is not waited for while none of its is due.
 """
 
@@ -13,8 +13,8 @@ from rig_protocol.frames import RgbdFrame, mean_time_ns
 from rig_server.camera_queue import CameraQueue, Head
 from rig_server.rig_queues import RigQueues
 
-# A move of the cut costs frames. In the first sets after a camera joined it is worth this gain of spread,
-# in periods (above the jitter of software time stamps), and once in so many sets later on ...
+# A move of the cut costs frames. In the first sets after a camera joined or left it is worth this gain of
+# spread, in periods (above the jitter of software time stamps), and once in so many sets later on ...
 _SMALL_GAIN = 0.05
 _SETTLING_SETS = 30
 _SETTLED_SETS = 1500
@@ -36,7 +36,6 @@ class WaitingPolicy:
         self._deadline_ns = deadline_ns
         self._max_spread_ns = max_spread_ns
         self._strict = strict
-        self._guessed = False  # a frame was skipped on a guess since the last set
         self._settling = _SETTLING_SETS
         self._since_move = 0
         self.blocker: CameraQueue | None = None
@@ -109,7 +108,6 @@ class WaitingPolicy:
         if not all(head.here for head in window):
             return window
         self._note_move(early)
-        self._guessed |= not all(head.following_here for head in early)
         self._queues.skip([head.queue for head in early])
         return None
 
@@ -120,20 +118,11 @@ class WaitingPolicy:
             self._since_move = 0
 
     def _better_cut(self, window: Sequence[Head], hysteresis_ns: float) -> int:
-        """How many of the earliest heads to leave out for a tighter set; 0 when this one is tight enough.
-
-        Guesses about frames to come may skip frames once a set: a camera that runs irregularly must
-        not keep the set from ever going out.
-        """
+        """How many of the earliest heads to leave out for a tighter set; 0 when this one is tight enough."""
         last_ns = window[-1].exposure_ns
         best, best_spread_ns = 0, last_ns - window[0].exposure_ns - hysteresis_ns
-        guessed = False
         for cut in range(1, len(window)):
-            before = window[cut - 1]
-            last_ns = max(last_ns, before.following_ns)
-            guessed = guessed or not before.following_here
-            if guessed and self._guessed and (self._strict or 2 * cut < len(window)):
-                continue
+            last_ns = max(last_ns, window[cut - 1].following_ns)
             spread_ns = last_ns - window[cut].exposure_ns
             if spread_ns < best_spread_ns:
                 best, best_spread_ns = cut, spread_ns
@@ -158,7 +147,6 @@ class WaitingPolicy:
                 queue.miss(end_ns, waited=queue in awaited)
         self._queues.update_oldest()
         self._queues.close(mean_time_ns(taken.values()))
-        self._guessed = False
         self._settling = max(self._settling - 1, 0)
         self._since_move += 1
         return taken

@@ -1,28 +1,23 @@
 """Real agents and servers as processes, real sockets on loopback, and waiting for what they do."""
 
-import atexit
 import re
-import secrets
 import signal
 import socket
 import subprocess
 import sys
-import tempfile
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from functools import cache
 from pathlib import Path
 
 import numpy as np
 
 from rig_protocol.camera import CameraModel
 from rig_protocol.frames import PanoramicFrame, RgbdFrame
-from rig_protocol.key_file import write_key
 from rig_protocol.rig_folder import CameraEntry, RigDescription, RingDrawing, write_rig_folder
-from rig_protocol.rig_key import RigKey
 from rig_server import Rig
 from rig_server.config import CameraSettings, RigSettings
+from support.key_for_tests import rig_key_file
 
 LOOPBACK = "127.0.0.1"
 START_TIMEOUT_S = 60.0  # a dozen interpreters start at once on two busy cores
@@ -42,15 +37,6 @@ def server_settings(port: int, cameras: int, **changes: object) -> RigSettings:
     listed = tuple(CameraSettings(id=i) for i in range(cameras))
     options = {"listen": f"{LOOPBACK}:{port}", "cameras": listed, "key_file": rig_key_file()}
     return RigSettings.model_validate(options | changes)
-
-
-@cache
-def rig_key_file() -> Path:
-    """The key that servers and agents of one test run share."""
-    folder = tempfile.TemporaryDirectory(prefix="rig-key-")
-    atexit.register(folder.cleanup)
-    write_key(path := Path(folder.name) / "rig.key", RigKey.generate(secrets.token_bytes))
-    return path
 
 
 class AgentProcess:

@@ -7,6 +7,7 @@ from rich.console import Console
 from rig_server.assembler import SetRecord
 from rig_server.live_table import LiveDisplay, status_line, status_table
 from rig_server.metrics import CameraMetrics, RateMeter, RigStatus, summarise_sets
+from rig_server.synchroniser import IncompleteSet
 
 S = 1_000_000_000
 
@@ -62,6 +63,12 @@ def test_sets_are_summarised_over_the_last_three_seconds() -> None:
     assert spread_ms == 26.0
     assert missing == (3,)
     assert summarise_sets(old, 12 * S) == (0.0, None, ())
+
+
+def test_cameras_that_incomplete_sets_lacked_are_named_though_no_set_went_out() -> None:
+    incomplete = [IncompleteSet(0, (7,)), *(IncompleteSet(11 * S, (3, 5)) for _ in range(9))]
+    incomplete += [IncompleteSet(11 * S, (3, 4))] * 3
+    assert summarise_sets([], 12 * S, incomplete) == (0.0, None, (3, 5, 4))
 
 
 def test_the_table_fits_80_columns_with_every_figure_at_full_length() -> None:

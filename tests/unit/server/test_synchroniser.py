@@ -158,6 +158,14 @@ def test_a_slow_camera_is_missing_from_one_set_each_time_it_slides_by_a_frame() 
     assert 1 <= sum(not panorama.complete for panorama in steady) <= 3
 
 
+def test_when_a_camera_leaves_the_others_find_their_own_tightest_set() -> None:
+    arrivals = stream(0, 0, 100) + stream(1, 10 * MS, 160) + stream(2, 24 * MS, 160)
+    leaves_ns = 100 * PERIOD_NS + 40 * MS
+    delivered = run(joined(range(3)), arrivals, [(leaves_ns, lambda s: s.camera_left(0))])
+    assert delivered[80].panorama.spread_ns == PERIOD_NS - 14 * MS
+    assert all(panorama.spread_ns == 14 * MS for _, panorama in delivered[120:-3])
+
+
 def test_a_lost_frame_leaves_one_partial_set_and_the_next_sets_complete() -> None:
     arrivals = [item for i in range(4) for item in stream(i, i * 5 * MS, 30)]
     lost = [(now, f) for now, f in arrivals if not (f.camera_id == 2 and f.sequence == 10)]
