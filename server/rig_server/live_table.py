@@ -19,7 +19,7 @@ _LINE_EVERY_S = 5.0
 _HIGH_LOSS = 0.001  # a complete set in a thousand is missing for it
 _HIGH_CLOCK_ERROR_US = 500.0
 _HIGH_TEMPERATURE_C = 80.0  # a Pi slows down
-_CALM, _PLAIN, _TROUBLE = "dim", "", "bold yellow"
+_CALM, _PLAIN, _TROUBLE = "dim", "", "bold not dim yellow"
 
 
 class LiveDisplay:

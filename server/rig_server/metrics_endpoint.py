@@ -26,7 +26,7 @@ logger = logging.getLogger(__name__)
 _PATH = "/metrics"
 _ENDS = (b"\r\n\r\n", b"\n\n")
 _MAX_REQUEST_BYTES = 8192  # a scrape's request has some 500
-_REQUEST_TIMEOUT_S = 2.0  # for the whole request, and once more for the answer
+_REQUEST_TIMEOUT_S = 1.0  # for the whole request, and once more for the answer
 # Prometheus needs one; when there are more, the oldest gives way.
 _MAX_CONNECTIONS = 8
 # At most 100 connections a second are accepted, and a status is read four times: a flood of scrapes costs
