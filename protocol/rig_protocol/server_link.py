@@ -63,6 +63,7 @@ from rig_protocol.roster import Roster
 from rig_protocol.sealed_channel import SealedChannel
 from rig_protocol.security import RandomBytes
 from rig_protocol.server_session import CameraStatus, ServerSession
+from rig_protocol.system_clock import SystemClockReading
 
 _NOTICE_INTERVAL_NS = 100_000_000  # to one address
 _NOTICE_INTERVAL_ALL_NS = 5_000_000
@@ -96,6 +97,8 @@ class ServerLink:
                 f"datagram size {datagram_size} is not in {MIN_DATAGRAM_SIZE}..{MAX_DATAGRAM_SIZE}"
             )
         self.rejected: Counter[str] = Counter()
+        self.system_clock: SystemClockReading | None = None
+        """What the server machine's system clock is worth, set by the shell every second or so."""
         self._roster = roster
         self._rig_key, self._random_bytes = rig_key, random_bytes
         self._color_codecs, self._depth_codecs = tuple(color_codecs), tuple(depth_codecs)
@@ -251,7 +254,7 @@ class ServerLink:
             case Heartbeat():
                 session.receive_heartbeat(message, now_ns)
             case ClockReply():
-                session.receive_clock_reply(message, now_ns)
+                session.receive_clock_reply(message, self.system_clock, now_ns)
             case Goodbye(text):
                 self._end(session, f"goodbye: {text}")
 

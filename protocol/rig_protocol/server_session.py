@@ -15,6 +15,7 @@ from rig_protocol.messages import ClockReply, Heartbeat, Hello, Message, StreamC
 from rig_protocol.reassembler import Reassembler
 from rig_protocol.sealed_channel import SealedChannel
 from rig_protocol.security import FrameSeal
+from rig_protocol.system_clock import SystemClockReading
 
 SILENCE_NS = 2_000_000_000
 # A frame is in the past when it arrives; clocks and their reading err by so much beyond the uncertainty.
@@ -91,13 +92,19 @@ class ServerSession:
         """The datagram of a message to this agent."""
         return self._channel.seal(*encode_body(message))
 
-    def receive_clock_reply(self, reply: ClockReply, now_ns: int) -> None:
-        """Take a clock reply into the estimate."""
-        counters = self.status.counters
-        steps_before = self._clock.steps
-        if not self._clock.receive(reply, now_ns):
+    def receive_clock_reply(
+        self, reply: ClockReply, rig_system_clock: SystemClockReading | None, now_ns: int
+    ) -> None:
+        """Take a clock reply into the estimate, and what both machines say of their system clocks."""
+        counters, clock = self.status.counters, self._clock
+        before = clock.steps, clock.system_clock_disagreements
+        if clock.receive(reply, now_ns):
+            told = SystemClockReading(reply.wall_minus_agent_ns, reply.wall_error_ns)
+            clock.use_system_clocks(told, rig_system_clock, now_ns)
+        else:
             counters.bad_clock_reply += 1
-        counters.clock_steps += self._clock.steps - steps_before
+        counters.clock_steps += clock.steps - before[0]
+        counters.system_clock_disagreements += clock.system_clock_disagreements - before[1]
         self.status.clock = self._clock.estimate
         self.due_ns = min(self.due_ns, self._clock.next_request_ns)
 

@@ -119,7 +119,7 @@ class RigSettings(Settings):
     """The rig's key, as `rig-server keygen` made it; unset: ./rig.key, else /etc/kinect-rig/rig.key."""
     insecure: bool = False
     """Take frames of anybody who sends some: only for an isolated bench."""
-    receive_buffer_bytes: int = Field(8 << 20, ge=65_536, le=1 << 30)
+    receive_buffer_bytes: int = Field(32 << 20, ge=65_536, le=1 << 30)
     """Kernel receive buffer to ask for; the kernel's limit is net.core.rmem_max."""
     decoder_threads: int = Field(2, ge=1, le=64)
     """Threads that decode frames; a pair takes about 2 ms of one core."""

@@ -9,7 +9,7 @@ from typing import Any
 import cv2
 import numpy as np
 
-from rig_protocol.codecs import COLOR_CODECS, DEPTH_CODECS, codec, warm_up
+from rig_protocol.codecs import COLOR_CODECS, DEPTH_CODECS, codec, keep_freed_memory, warm_up
 from rig_protocol.errors import DataError
 from rig_protocol.frames import EncodedFrame, Payload, RgbdFrame
 
@@ -68,6 +68,7 @@ class FrameDecoder:
         if threads < 1 or capacity < 1:
             raise ValueError(f"threads {threads} and capacity {capacity} must be positive")
         warm_up()
+        keep_freed_memory()
         if demosaic:  # one image a call is too little for OpenCV's own threads, which take turns with ours
             cv2.setNumThreads(1)
         self._deliver = deliver

@@ -22,6 +22,10 @@ _COUNTERS = {
     "late": ("rig_fragments_late", "Fragments of frames that had been delivered or given up."),
     "duplicate": ("rig_fragments_duplicate", "Fragments that came twice."),
     "clock_steps": ("rig_clock_steps", "Jumps of the camera's clock."),
+    "system_clock_disagreements": (
+        "rig_system_clock_disagreements",
+        "System clocks that called themselves disciplined and that the exchange disproved.",
+    ),
 }
 LOST_CAUSES = ("missing", "incomplete", "evicted", "corrupt", "unexpected_codec", "untimed", "overflow")
 _DROPPED_CAUSES = ("oversized", "bad_fragment", "bad_clock_reply", "bad_seal", "replayed")
@@ -96,13 +100,19 @@ def _clocks(cameras: Iterable[CameraMetrics]) -> Iterator[Metric]:
     drift = _gauge("rig_clock_drift_ratio", "Change of the offset, in seconds a second.", "camera")
     error = _gauge("rig_clock_uncertainty_seconds", "Standard uncertainty of the offset.", "camera")
     trip = _gauge("rig_clock_round_trip_seconds", "Shortest round trip of the clock exchange.", "camera")
+    system = _gauge(
+        "rig_clock_by_system_time",
+        "1 while both machines' disciplined clocks tell the offset.",
+        "camera",
+    )
     for camera in cameras:
         if (clock := camera.clock) is not None:
+            system.add_metric([camera.name], clock.source == "system")
             offset.add_metric([camera.name], clock.offset_ns / 1e9)
             drift.add_metric([camera.name], clock.drift_ppm / 1e6)
             error.add_metric([camera.name], clock.uncertainty_ns / 1e9)
             trip.add_metric([camera.name], clock.delay_ns / 1e9)
-    yield from (offset, drift, error, trip)
+    yield from (offset, drift, error, trip, system)
 
 
 def _agents(cameras: Iterable[CameraMetrics]) -> Iterator[Metric]:

@@ -22,6 +22,7 @@ from rig_protocol.rig_folder import RigDescription
 from rig_protocol.rig_key import RigKey
 from rig_protocol.roster import Roster, Slot
 from rig_protocol.server_link import ServerLink
+from rig_protocol.system_clock import SystemClock
 from rig_server.assembler import Assembler
 from rig_server.attendance import absence_message, is_whole
 from rig_server.config import RigSettings
@@ -38,6 +39,7 @@ from rig_server.synchroniser import Synchroniser
 
 logger = logging.getLogger(__name__)
 
+_SYSTEM_CLOCK_INTERVAL_NS = 1_000_000_000
 _REFUSALS = 8  # the latest refused hellos, for the message about cameras that do not come
 
 
@@ -69,7 +71,7 @@ class LivePipeline:
             settings.address,
             self._on_event,
             settings.receive_buffer_bytes,
-            on_turn=self._streams.turn,
+            on_turn=self._on_turn,
         )
         # After the port is ours: its first construction on a machine compiles for seconds.
         self._decoder = FrameDecoder(
@@ -84,6 +86,8 @@ class LivePipeline:
             self._durations,
             self._streams,
         )
+        self._system_clock = SystemClock(rig_time_ns, time.time_ns)
+        self._system_clock_read_ns = 0
         self._presence = threading.Lock()  # guards what follows
         self._connected: set[int] = set()
         self._hellos: dict[int, Hello] = {}
@@ -171,6 +175,13 @@ class LivePipeline:
                     told = any(known.address == address and known.text == text for known in self._refusals)
                     self._refusals.append(event)
                 logger.log(logging.DEBUG if told else logging.WARNING, "refused %s: %s", address[0], text)
+
+    def _on_turn(self, now_ns: int) -> None:
+        """On the receiver's thread, after every wake-up."""
+        self._streams.turn(now_ns)
+        if abs(now_ns - self._system_clock_read_ns) >= _SYSTEM_CLOCK_INTERVAL_NS:
+            self._system_clock_read_ns = now_ns
+            self._link.system_clock = self._system_clock.read()
 
 
 def _synchroniser(settings: RigSettings) -> Synchroniser:

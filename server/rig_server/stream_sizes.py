@@ -8,13 +8,13 @@ _PIXELS = 640 * 480
 # KiB of a 640×480 image: (mean of the real frames of docs/performance.md, pure noise). The scene decides
 # what is between.
 _KIB = {
-    "bayer-lossless": (158.9, 301),
-    "bgr-lossless": (398.4, 901),
-    "grey-lossless": (113.8, 301),
+    "bayer-lossless": (167.5, 301),
+    "bgr-lossless": (410.8, 901),
+    "grey-lossless": (119.0, 301),
     "bgr-jpeg": (59.9, 271),
     "grey-jpeg": (49.8, 238),
-    "disparity-lossless": (32.4, 450),
-    "depth-lossless": (41.2, 545),
+    "disparity-lossless": (36.9, 450),
+    "depth-lossless": (42.7, 545),
 }
 _BYTES_PER_PIXEL = {"bayer": 1, "grey": 1, "bgr": 3, "raw": 2, "depth_mm": 2}
 

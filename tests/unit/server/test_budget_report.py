@@ -41,7 +41,7 @@ def test_what_is_chosen_is_what_the_planner_answers() -> None:
     assert half.chosen_fps == 30.0
     tenth = report(speed_mbit=100)
     assert row(tenth, "JPEG").chosen
-    assert tenth.chosen_fps == 7.5
+    assert tenth.chosen_fps == 6.0
 
 
 def test_when_nothing_fits_nothing_is_chosen_and_the_reason_is_given() -> None:

@@ -53,7 +53,7 @@ def test_twelve_kinects_at_full_rate_go_lossless_through_a_gigabit_port() -> Non
     )
     assert len(made.notes) == 1
     assert (
-        "12 cameras at 30 fps need 90.1 MB/s, 75% of the link: everything goes losslessly"
+        "12 cameras at 30 fps need 96.3 MB/s, 81% of the link: everything goes losslessly"
         in made.notes[0].text
     )
 
@@ -65,8 +65,8 @@ def test_a_link_that_is_too_small_gets_jpeg_at_once_and_one_line_says_why() -> N
     assert made.now.fps == 30.0
     (told,) = said(made, logging.WARNING)
     assert told == (
-        "12 cameras at 30 fps need 90.1 MB/s, the link carries 59.8, of which 95% may be used: "
-        "colour goes as JPEG at 30 fps (43.5 MB/s)"
+        "12 cameras at 30 fps need 96.3 MB/s, the link carries 59.8, of which 95% may be used: "
+        "colour goes as JPEG at 30 fps (45.6 MB/s)"
     )
 
 
@@ -82,7 +82,7 @@ def test_without_an_expected_number_each_camera_that_joins_may_bring_a_step() ->
     made = PlannedRig(planner, OFFICE)
     fps = [one.fps for one in made.join(12) if isinstance(one, StreamChoice)]
     assert fps == sorted(fps, reverse=True)
-    assert (fps[0], fps[-1]) == (30.0, 15.0)
+    assert (fps[0], fps[-1]) == (30.0, 10.0)
     assert len({(one.color_codec, one.fps) for one in planner.choices.values()}) == 1
 
 
@@ -121,8 +121,8 @@ def test_without_adaptation_what_cannot_fit_is_refused_with_what_would() -> None
     planner = StreamPlanner(LinkSettings(speed_mbit=500, adapt=False), 12)
     refusal = planner.camera_joined(0, KINECT, AWAY, 0)
     assert isinstance(refusal, Refusal)
-    assert "12 cameras at 30 fps need 90.1 MB/s, the link carries 59.8" in refusal.text
-    assert "colour goes as JPEG at 30 fps (43.5 MB/s)" in refusal.text
+    assert "12 cameras at 30 fps need 96.3 MB/s, the link carries 59.8" in refusal.text
+    assert "colour goes as JPEG at 30 fps (45.6 MB/s)" in refusal.text
     assert planner.choices == {}
 
 
