@@ -37,6 +37,7 @@ bench: bench-codecs bench-transport  ## all figures, into build/bench.json
 
 docs: $(READY)  ## the pages that are made from the code
 	$(BIN)/python docs/generate_configuration.py
+	$(BIN)/python docs/generate_monitoring.py
 
 clean:  ## everything that make built
 	rm -rf $(VENV) build

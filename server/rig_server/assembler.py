@@ -2,6 +2,7 @@
 
 import threading
 from collections import deque
+from collections.abc import Callable
 from dataclasses import dataclass
 
 from rig_protocol.frames import PanoramicFrame, RgbdFrame
@@ -46,11 +47,12 @@ class Assembler:
     """Guards a synchroniser with a lock and keeps the sets that nobody took yet, the newest few.
 
     Overdue sets go out when a frame comes or while somebody waits in `next_panorama`: no thread of its own.
-    When nobody waits and no frame comes they go out at the next call.
+    When nobody waits and no frame comes they go out at the next call. `on_set` is called for every set that
+    goes out, on whichever thread that happens; it must not block.
     """
 
-    def __init__(self, synchroniser: Synchroniser) -> None:
-        self._synchroniser = synchroniser
+    def __init__(self, synchroniser: Synchroniser, on_set: Callable[[SetRecord], None] | None = None) -> None:
+        self._synchroniser, self._on_set = synchroniser, on_set
         self._set_ready = threading.Condition()
         self._ready: deque[PanoramicFrame] = deque()
         self._recent: deque[SetRecord] = deque(maxlen=_RECENT)
@@ -129,6 +131,11 @@ class Assembler:
         return self._synchroniser.waiting
 
     @property
+    def ready(self) -> int:
+        """Sets that nobody took yet."""
+        return len(self._ready)
+
+    @property
     def recent(self) -> tuple[SetRecord, ...]:
         """The last sets that went out, oldest first."""
         with self._set_ready:
@@ -154,6 +161,9 @@ class Assembler:
                 self._ready.popleft()
                 self.overrun += 1
             self._ready.append(panorama)
-            self._recent.append(SetRecord.of(panorama, now_ns))
+            record = SetRecord.of(panorama, now_ns)
+            self._recent.append(record)
+            if self._on_set is not None:
+                self._on_set(record)
             count += 1
         return count

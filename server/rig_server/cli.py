@@ -1,6 +1,8 @@
 """The command line of `rig-server`."""
 
+import contextlib
 import json
+from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -22,6 +24,8 @@ _EXAMPLES = """
 `rig-server init` — write ./rig.toml, every option explained, then list your cameras in it
 
 `rig-server` — receive on UDP port 4012 and show the live table until Ctrl-C
+
+`rig-server --metrics 9100` — the same, and metrics for a Prometheus on this machine
 
 `rig-server --calibrate --out calibration` — calibrate the ring that streams to this PC
 
@@ -52,6 +56,10 @@ def run(
     ] = None,
     listen: Annotated[
         str | None, typer.Option(metavar="HOST:PORT", help="Receive here; else 0.0.0.0:4012.")
+    ] = None,
+    metrics: Annotated[
+        str | None,
+        typer.Option(metavar="[HOST:]PORT", help="Serve metrics to Prometheus; to this machine unless HOST."),
     ] = None,
     calibrate: Annotated[
         bool, typer.Option("--calibrate", help="Calibrate the ring on the first complete sets, then end.")
@@ -92,6 +100,7 @@ def run(
     changes = {
         "listen": listen,
         "insecure": insecure or None,
+        "metrics": metrics,
         "capture": {"frames": frames},
         "calibration": {"method": method},
     }
@@ -104,11 +113,13 @@ def run(
         from rig_server.calibrating import calibrate_rig
 
         make_output_folder(folder := out or Path("calibration"))
-        calibrate_rig(_open_rig(settings, simulate, seed), folder, console)
+        with _open_rig(settings, simulate, seed) as rig:
+            calibrate_rig(rig, folder, console)
     else:
         from rig_server.receiving import receive
 
-        receive(_open_rig(settings, simulate, seed), console)
+        with _open_rig(settings, simulate, seed) as rig:
+            receive(rig, console)
 
 
 @app.command()
@@ -199,12 +210,15 @@ def budget(
         raise typer.Exit(EXIT_FAILED)
 
 
-def _open_rig(settings: "RigSettings", simulate: int | None, seed: int | None) -> "Rig":
+@contextlib.contextmanager
+def _open_rig(settings: "RigSettings", simulate: int | None, seed: int | None) -> Iterator["Rig"]:
+    """The rig that the options ask for, not begun yet, and its metrics where settings ask for them."""
+    from rig_server.metrics_endpoint import metrics_served
     from rig_server.rig import Rig
 
-    if simulate is None:
-        return Rig.live(settings)
-    return Rig.simulated(simulate, seed or 0, settings=settings)
+    rig = Rig.live(settings) if simulate is None else Rig.simulated(simulate, seed or 0, settings=settings)
+    with contextlib.closing(rig), metrics_served(settings.metrics_address, rig.status):
+        yield rig
 
 
 def _refuse_options_without_effect(

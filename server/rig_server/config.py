@@ -125,6 +125,8 @@ class RigSettings(Settings):
     """Threads that decode frames; a pair takes about 2 ms of one core."""
     demosaic: bool = False
     """Whether the decoder threads make the colour image of every Bayer frame, too; else who needs it does."""
+    metrics: str | None = Field(None, examples=["9100"])
+    """Where Prometheus may ask for metrics, [HOST:]PORT; a port alone is for this machine only."""
     log_level: Literal["DEBUG", "INFO", "WARNING", "ERROR"] = "INFO"
     """What is worth a line in the log."""
     synchroniser: SynchroniserSettings = SynchroniserSettings()
@@ -142,6 +144,18 @@ class RigSettings(Settings):
         parse_address(text)
         return text
 
+    @field_validator("metrics", mode="before")
+    @classmethod
+    def _metrics_may_be_a_number(cls, value: object) -> object:
+        return str(value) if isinstance(value, int) else value
+
+    @field_validator("metrics")
+    @classmethod
+    def _metrics_is_an_address(cls, text: str | None) -> str | None:
+        if text is not None:
+            parse_metrics_address(text)
+        return text
+
     @model_validator(mode="after")
     def _cameras_are_distinct(self) -> Self:
         for key in ("id", "label", "serial"):
@@ -157,6 +171,11 @@ class RigSettings(Settings):
     def address(self) -> Address:
         """`listen` as (host, port)."""
         return parse_address(self.listen)
+
+    @property
+    def metrics_address(self) -> Address | None:
+        """`metrics` as (host, port); None when nobody may ask."""
+        return None if self.metrics is None else parse_metrics_address(self.metrics)
 
 
 def load_rig_settings(file: Path | None, overrides: Mapping[str, Any] | None = None) -> RigSettings:
@@ -176,6 +195,14 @@ def parse_address(text: str) -> Address:
     if not port_text.isdecimal() or not 0 <= int(port_text) <= 65_535:
         raise ValueError(f"{text!r} is not HOST:PORT with a port from 0 to 65535")
     return host or "0.0.0.0", int(port_text)  # noqa: S104  # an empty host means all interfaces, as in `:4012`
+
+
+def parse_metrics_address(text: str) -> Address:
+    """[HOST:]PORT; without a host only this machine may ask. ValueError says what is wrong with it."""
+    host, _, port = text.rpartition(":")
+    if not port.isdecimal() or text.startswith(":"):
+        raise ValueError(f"{text!r} is not PORT or HOST:PORT; for all interfaces write 0.0.0.0:PORT")
+    return parse_address(f"{host or '127.0.0.1'}:{port}")
 
 
 def read_intrinsics(path: Path) -> CameraModel:

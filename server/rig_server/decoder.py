@@ -87,6 +87,11 @@ class FrameDecoder:
             thread.start()
 
     @property
+    def waiting(self) -> int:
+        """Frames that wait for a thread."""
+        return len(self._waiting)
+
+    @property
     def dropped_by_camera(self) -> Counter[int]:
         """Frames that gave way to newer ones."""
         with self._changed:

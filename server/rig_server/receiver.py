@@ -16,7 +16,7 @@ from typing import Protocol
 from rig_protocol.datagram import DatagramBatch
 from rig_protocol.events import Address, ServerEvent
 from rig_server.gatherer import Gatherer
-from rig_server.udp_socket import ask_for_receive_buffer, bound_udp_socket, switch_on
+from rig_server.udp_socket import ask_for_receive_buffer, bound_udp_socket, switch_on, waiting_bytes
 
 logger = logging.getLogger(__name__)
 
@@ -102,6 +102,11 @@ class Receiver:
         """Where the socket is bound; the port is the real one when 0 was asked for."""
         host, port = self._socket.getsockname()[:2]
         return str(host), int(port)
+
+    @property
+    def waiting_bytes(self) -> int:
+        """How much of the kernel's receive buffer is taken."""
+        return waiting_bytes(self._socket)
 
     def start(self) -> None:
         """Start receiving."""
