@@ -119,6 +119,11 @@ class ServerLink:
         self._refusal_events = RateLimit(_REFUSAL_EVENT_INTERVAL_NS)
 
     @property
+    def authenticated(self) -> bool:
+        """True where only who holds a secret key may join."""
+        return not self._rig_key.is_public
+
+    @property
     def cameras(self) -> Mapping[int, CameraStatus]:
         """Every camera that was here since the start, by id; a live view."""
         return MappingProxyType(self._statuses)

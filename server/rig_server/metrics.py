@@ -76,6 +76,7 @@ class RigStatus:
     durations: Mapping[str, HistogramSnapshot] = field(default_factory=dict)
     recent: Mapping[str, HistogramSnapshot] = field(default_factory=dict)
     link: str | None = None
+    authenticated: bool = False
 
     @property
     def connected(self) -> int:

@@ -47,6 +47,7 @@ class StatusReader:
             assembler.recent, now_ns, assembler.recent_incomplete
         )
         return RigStatus(
+            authenticated=self._link.authenticated,
             cameras=self._cameras(hellos, now_ns),
             complete=assembler.complete,
             partial=assembler.partial,

@@ -129,7 +129,7 @@ def _measurement(
         rss_mb=window.rss_mb,
         dropped=status.dropped,
         lost_frames=sum(camera.lost for camera in status.cameras),
-        authenticated=bool(getattr(status, "authenticated", False)),
+        authenticated=status.authenticated,
     )
 
 
