@@ -13,7 +13,7 @@ import shutil
 import signal
 import subprocess
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from functools import cache
 from pathlib import Path
 from typing import IO
@@ -108,9 +108,15 @@ def command(line: str, script: str | None = None) -> str:
     return done.stdout
 
 
+def existing_namespaces() -> list[str]:
+    """Names of all network namespaces of this machine."""
+    listed = command("ip -j netns list")
+    return [entry["name"] for entry in json.loads(listed or "[]")]
+
+
 def remove_stale() -> None:
     """Remove namespaces whose owner has died without doing it."""
-    for name in _existing():
+    for name in existing_namespaces():
         owner = _OWNER.match(name)
         if owner is not None and not _alive(int(owner[1])):
             _remove(name)
@@ -139,25 +145,20 @@ def why_unavailable() -> str | None:
     return None
 
 
-def _existing() -> list[str]:
-    listed = command("ip -j netns list")
-    return [entry["name"] for entry in json.loads(listed or "[]")]
-
-
 def _alive(process_id: int) -> bool:
     return Path(f"/proc/{process_id}").exists()
 
 
 def _remove(name: str) -> None:
     """What still runs there was started by its owner, for instance by a program under test."""
-    if name not in _existing():
-        return
-    for process_id in command(f"ip netns pids {name}").split():
-        try:
-            os.kill(int(process_id), signal.SIGKILL)
-        except ProcessLookupError:
-            continue
-    command(f"ip netns delete {name}")
+    try:
+        for process_id in command(f"ip netns pids {name}").split():
+            with suppress(ProcessLookupError):
+                os.kill(int(process_id), signal.SIGKILL)
+        command(f"ip netns delete {name}")
+    except OSError:
+        if name in existing_namespaces():  # else another process has removed it meanwhile
+            raise
 
 
 def _enter(descriptor: int) -> None:

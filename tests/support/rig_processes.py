@@ -40,11 +40,19 @@ class AgentProcess:
     """One `rig-agent`, restartable; everything it prints goes to its log."""
 
     def __init__(
-        self, log: Path, port: int, options: Sequence[object], env: Mapping[str, str] | None = None
+        self,
+        log: Path,
+        port: int,
+        options: Sequence[object],
+        env: Mapping[str, str] | None = None,
+        *,
+        host: str = LOOPBACK,
+        prefix: Sequence[str] = (),
     ) -> None:
+        """`host` is the server's; `prefix` runs the agent elsewhere: ip netns exec NAME."""
         self._log, self._env = log, env
         self._words = [
-            *(sys.executable, "-m", "rig_agent.cli", "--server", f"{LOOPBACK}:{port}"),
+            *(*prefix, sys.executable, "-m", "rig_agent.cli", "--server", f"{host}:{port}"),
             *map(str, options),
         ]
         self._process: subprocess.Popen[bytes] | None = None
@@ -91,7 +99,14 @@ class AgentProcess:
 
 @contextmanager
 def folder_agents(
-    folder: Path, logs: Path, port: int, cameras: Sequence[int], fps: float = 10.0
+    folder: Path,
+    logs: Path,
+    port: int,
+    cameras: Sequence[int],
+    fps: float = 10.0,
+    *,
+    host: str = LOOPBACK,
+    prefix: Callable[[int], Sequence[str]] = lambda _camera: (),
 ) -> Iterator[dict[int, AgentProcess]]:
     """Agents that each play one camera of a rig folder; stopped at the end, whatever happened."""
     agents = {
@@ -99,6 +114,8 @@ def folder_agents(
             logs / f"agent{camera:02d}.log",
             port,
             ["--source", "folder", "--path", folder, "--camera", camera, "--fps", fps],
+            host=host,
+            prefix=prefix(camera),
         )
         for camera in cameras
     }
