@@ -25,8 +25,9 @@ WIRE_OVERHEAD = 66
 """Bytes on the wire beside that payload: UDP, IP and Ethernet headers, checksum, preamble and gap."""
 
 _UNSEEN_OVERHEAD = 24  # of these the kernel counts 42; the rest: 4 checksum, 8 preamble, 12 gap
-# What the shaper lets through at once: its timer's precision, 131 µs at 1 Gbit/s. It counts as buffer.
-_BUCKET = 16 * 1024
+# What the shaper lets through at once after a pause: it makes up for a timer that is 260 µs late. Counted as
+# part of the buffer, so that a port that is never idle has less buffer than it claims, and never more.
+_BUCKET = 32 * 1024
 _HOST_QUEUE = 4 << 20  # a host's own queue loses nothing: its socket buffers are smaller
 # Without these every datagram crosses the cables as a frame of its own, and the shaper sees each.
 _NO_OFFLOAD = "tso off gso off tx-udp-segmentation off gro off"
@@ -74,7 +75,7 @@ class VirtualNetwork:
         self, hosts: int = 12, link_mbit: int = 1000, buffer_kib: int = 128, host_mbit: int | None = None
     ) -> None:
         if not 0 < hosts <= _MAX_HOSTS or buffer_kib * 1024 <= _BUCKET:
-            raise ValueError(f"{hosts} hosts (1 to {_MAX_HOSTS}), buffer {buffer_kib} KiB (more than 16)")
+            raise ValueError(f"{hosts} hosts (1 to {_MAX_HOSTS}), buffer {buffer_kib} KiB (more than 32)")
         self.hosts = tuple(host_name(i) for i in range(hosts))
         self.link_mbit, self.buffer_kib, self._host_mbit = link_mbit, buffer_kib, host_mbit
         self._namespaces = Namespaces()
