@@ -48,13 +48,19 @@ class AgentProcess:
         port: int,
         options: Sequence[object],
         env: Mapping[str, str] | None = None,
+        *,
+        host: str = LOOPBACK,
+        prefix: Sequence[str] = (),
         stepping: bool = False,
     ) -> None:
-        """`stepping`: SIGUSR1 and SIGUSR2 make its clock jump (support/stepping_clock.py)."""
+        """`host` is the server's; `prefix` runs the agent elsewhere: ip netns exec NAME.
+
+        `stepping`: SIGUSR1 and SIGUSR2 make its clock jump (support/stepping_clock.py).
+        """
         self._log, self._env = log, env
         program = [str(_STEPPING_CLOCK), "rig_agent.cli"] if stepping else ["-m", "rig_agent.cli"]
         self._words = [
-            *(sys.executable, *program, "--server", f"{LOOPBACK}:{port}"),
+            *(*prefix, sys.executable, *program, "--server", f"{host}:{port}"),
             *("--key-file", str(rig_key_file())),
             *map(str, options),
         ]
@@ -107,7 +113,14 @@ class AgentProcess:
 
 @contextmanager
 def folder_agents(
-    folder: Path, logs: Path, port: int, cameras: Sequence[int], fps: float = 10.0
+    folder: Path,
+    logs: Path,
+    port: int,
+    cameras: Sequence[int],
+    fps: float = 10.0,
+    *,
+    host: str = LOOPBACK,
+    prefix: Callable[[int], Sequence[str]] = lambda _camera: (),
 ) -> Iterator[dict[int, AgentProcess]]:
     """Agents that each play one camera of a rig folder; stopped at the end, whatever happened."""
     agents = {
@@ -115,6 +128,8 @@ def folder_agents(
             logs / f"agent{camera:02d}.log",
             port,
             ["--source", "folder", "--path", folder, "--camera", camera, "--fps", fps],
+            host=host,
+            prefix=prefix(camera),
         )
         for camera in cameras
     }
