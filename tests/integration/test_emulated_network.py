@@ -164,7 +164,6 @@ def test_every_camera_comes_back_after_the_servers_cable_was_out(emulated: Emula
     emulated.wait_until_whole(timeout_s=10)
 
 
-@pytest.mark.xfail(strict=True, reason="version 1 of the protocol sends nothing twice")
 def test_a_network_that_loses_one_datagram_in_a_hundred_costs_no_frame(emulated: EmulatedRig) -> None:
     emulated.wait_until_whole()
     with emulated.network.loss(percent=1):

@@ -9,11 +9,10 @@ the network: a host that they held up would catch up in a burst that no twelve m
 import json
 import os
 import subprocess
-import tempfile
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -49,8 +48,6 @@ class Load:
     cameras: int = 12
     link_mbit: int = 1000
     buffer_kib: int = 128
-    agent: Mapping[str, object] = field(default_factory=dict)
-    """Further settings of the agents."""
 
     def slower(self, factor: int) -> "Load":
         """The same in slow motion: all rates divided, so that this machine is faster beside the network."""
@@ -68,6 +65,8 @@ class Outcome:
     frames: int
     lost_frames: int
     """Sent, but not here whole."""
+    resent: int
+    """Datagrams that came on request, because they had been lost."""
     port: PortCounters
     port_load: float
     """Share of its time that the port was sending."""
@@ -97,7 +96,8 @@ class Outcome:
 
 def run_load(load: Load, frames: Path) -> Outcome:
     """Build the network, run the load through it, remove it."""
-    settings = server_settings(_PORT, load.cameras, listen=f"{PC_ADDRESS}:{_PORT}")
+    link = {"speed_mbit": load.link_mbit, "switch_buffer_kib": load.buffer_kib, "usable": 1.0}
+    settings = server_settings(_PORT, load.cameras, listen=f"{PC_ADDRESS}:{_PORT}", link=link)
     with (
         VirtualNetwork(load.cameras, load.link_mbit, load.buffer_kib) as network,
         _without_decoding(),
@@ -115,6 +115,7 @@ def run_load(load: Load, frames: Path) -> Outcome:
                 lost_sets=window.tally.lost,
                 frames=window.frames,
                 lost_frames=window.lost_frames,
+                resent=window.resent,
                 port=window.port,
                 port_load=window.port.wire_bytes / window.seconds / (load.link_mbit * 1e6 / 8),
                 sender_dropped=sum(counts["dropped"] for r in results for counts in r["cameras"].values()),
@@ -157,6 +158,7 @@ class _Window:
     tally: SetTally
     frames: int
     lost_frames: int
+    resent: int
     port: PortCounters
     seconds: float
     cost: Cost
@@ -197,6 +199,8 @@ def _watch(
         - sum(camera.frames for camera in rig_before.cameras),
         lost_frames=sum(camera.lost for camera in rig_after.cameras)
         - sum(camera.lost for camera in rig_before.cameras),
+        resent=sum(camera.resent for camera in rig_after.cameras)
+        - sum(camera.resent for camera in rig_before.cameras),
         port=port_after.since(port_before),
         seconds=after.wall_s - before.wall_s,
         cost=process_meter.cost(before, after),
@@ -231,18 +235,14 @@ def _usual_priority_afterwards() -> Iterator[None]:
 @contextmanager
 def _senders(network: VirtualNetwork, load: Load, frames: Path) -> Iterator[list["subprocess.Popen[str]"]]:
     """One process on each host."""
-    with tempfile.NamedTemporaryFile("w", suffix=".json") as file:
-        json.dump(dict(load.agent), file)
-        file.flush()
-        settings = Path(file.name) if load.agent else None
-        plays = [
-            Play(f"{PC_ADDRESS}:{_PORT}", [i], load.fps, load.seconds, load.phase, load.paced, settings)
-            for i in range(load.cameras)
-        ]
-        yield [
-            network.run_in(host_name(i), play.command(frames), stdout=subprocess.PIPE)
-            for i, play in enumerate(plays)
-        ]
+    plays = [
+        Play(f"{PC_ADDRESS}:{_PORT}", [i], load.fps, load.seconds, load.phase, load.paced)
+        for i in range(load.cameras)
+    ]
+    yield [
+        network.run_in(host_name(i), play.command(frames), stdout=subprocess.PIPE)
+        for i, play in enumerate(plays)
+    ]
 
 
 def _result(sender: "subprocess.Popen[str]") -> dict[str, Any]:
@@ -256,7 +256,7 @@ def _without_decoding() -> "mock._patch[Any]":
     return mock.patch("rig_server.decoder.decode_frame", _undecoded)
 
 
-def _undecoded(frame: EncodedFrame) -> RgbdFrame:
+def _undecoded(frame: EncodedFrame, demosaic: bool = False) -> RgbdFrame:  # noqa: ARG001
     return RgbdFrame(
         frame.camera_id, frame.sequence, frame.timestamp_ns, bayer=_NO_IMAGE, received_ns=frame.received_ns
     )
