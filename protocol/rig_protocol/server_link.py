@@ -58,6 +58,7 @@ from rig_protocol.messages import (
 )
 from rig_protocol.pending_sessions import PendingSession, PendingSessions
 from rig_protocol.rate_limit import RateLimit
+from rig_protocol.resend_budget import ResendBudget
 from rig_protocol.rig_key import RigKey
 from rig_protocol.roster import Roster
 from rig_protocol.sealed_channel import SealedChannel
@@ -107,6 +108,7 @@ class ServerLink:
         self._closed = False
         self._statuses: dict[int, CameraStatus] = {}
         self._sessions: dict[int, ServerSession] = {}  # by session id
+        self._resend_budget = ResendBudget()
         self._pending = PendingSessions()
         self._clock_due: list[ServerSession] = []
         self._latest_ns = 0
@@ -172,6 +174,10 @@ class ServerLink:
             elif session.due_ns <= now_ns:  # only the clock can be due again
                 self._clock_due.append(session)
         self._due_ns = min((session.due_ns for session in self._sessions.values()), default=None)
+
+    def limit_resends(self, bytes_per_s: float | None) -> None:
+        """What the link has left for resends of all cameras; None: no limit."""
+        self._resend_budget.limit(bytes_per_s)
 
     def plan_stream(self, camera_id: int, choice: StreamChoice) -> None:
         """What a connected camera is to send from now on; told with its next clock request.
@@ -378,7 +384,9 @@ class ServerLink:
             status = CameraStatus(welcome.camera_id, hello.name, address, hello)
             self._statuses[welcome.camera_id] = status
         status.joined(hello, address)
-        self._sessions[welcome.session_id] = ServerSession(status, pending.agreement, now_ns)
+        self._sessions[welcome.session_id] = ServerSession(
+            status, pending.agreement, self._resend_budget, now_ns
+        )
         self._wake_at(now_ns)
         self._push(CameraJoined(welcome.camera_id, hello, address))
 

@@ -14,6 +14,7 @@ from rig_protocol.handshake import Agreement
 from rig_protocol.message_bytes import encode_body
 from rig_protocol.messages import ClockReply, Heartbeat, Hello, Message, StreamChoice, StreamPlan
 from rig_protocol.reassembler import Reassembler
+from rig_protocol.resend_budget import ResendBudget
 from rig_protocol.sealed_channel import SealedChannel
 from rig_protocol.security import FrameSeal
 from rig_protocol.system_clock import SystemClockReading
@@ -52,7 +53,9 @@ class ServerSession:
     `due_ns` is never later than the moment at which `handle_timeout` has something to do.
     """
 
-    def __init__(self, status: CameraStatus, agreement: Agreement, now_ns: int) -> None:
+    def __init__(
+        self, status: CameraStatus, agreement: Agreement, resend_budget: ResendBudget, now_ns: int
+    ) -> None:
         welcome, keys = agreement.welcome, agreement.keys
         self.status = status
         self.address = status.address  # a session is bound to it; the status may move on
@@ -64,7 +67,11 @@ class ServerSession:
         )
         self._clock = ClockSync(now_ns)
         self._reassembler = Reassembler(
-            welcome.camera_id, status.hello.fps, status.counters, FrameSeal(welcome.cipher, keys)
+            welcome.camera_id,
+            status.hello.fps,
+            status.counters,
+            FrameSeal(welcome.cipher, keys),
+            resend_budget,
         )
         self.due_ns = now_ns
 

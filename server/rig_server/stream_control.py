@@ -50,6 +50,7 @@ class StreamControl:
             self._tell()
 
     def _tell(self) -> None:
+        self._link.limit_resends(self._planner.spare_bytes_s)
         for camera_id, choice in self._planner.choices.items():
             if self._told.get(camera_id) != choice:
                 self._told[camera_id] = choice

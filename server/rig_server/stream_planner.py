@@ -26,6 +26,7 @@ _ROOM = 0.9  # a better level must leave a tenth of what may be used, or the nex
 # A gigabit port that came up as a 100-Mbit one carries a tenth. Losses below that are no overload.
 _LEAST_OVERLOAD = 0.1
 _SAME_STEP = (0.9, 1.2)  # times the present step: within, agents keep theirs
+_LEAST_SPARE = 0.01  # of the port, for resends on a link that frames fill
 _MAX_NOTES = 32  # an owner that never takes them loses the oldest
 
 
@@ -76,6 +77,14 @@ class StreamPlanner:
     def pacing(self) -> Pacing | None:
         """Steps and bursts; None before the first camera."""
         return self._pacing
+
+    @property
+    def spare_bytes_s(self) -> float | None:
+        """What the port carries beside the frames, at least a hundredth; None where nothing loads it."""
+        port_bytes_s = self._demand.port.udp_bytes_s
+        if not self._latest.udp_bytes_s:
+            return None
+        return max(port_bytes_s - self._latest.udp_bytes_s, _LEAST_SPARE * port_bytes_s)
 
     @property
     def summary(self) -> str:
