@@ -65,6 +65,22 @@ class RigQueues:
         if len(queue.pending) > MAX_PENDING:
             self.skip([queue])
 
+    def is_ahead_of(self, now_ns: int) -> bool:
+        """True when what is known is of a time to come: the rig clock was set back."""
+        arrived_later = self.oldest_arrival_ns is not None and self.oldest_arrival_ns > now_ns
+        return arrived_later or self._closed_ns > now_ns
+
+    def begin_anew(self) -> None:
+        """Forget all frames and times; the cameras stay, with their rates."""
+        known, self.by_id = self.by_id, {}
+        self.counters.skipped += sum(len(queue.pending) for queue in known.values())
+        self._closed_ns, self.oldest_arrival_ns = NEVER_NS, None
+        for camera_id, queue in known.items():
+            fresh = self[camera_id]
+            fresh.late = queue.late
+            if queue.live:
+                fresh.join(1e9 / queue.rate.period_ns)
+
     def skip(self, queues: list[CameraQueue]) -> None:
         """Leave the first frame of each of these out of every set."""
         for queue in queues:

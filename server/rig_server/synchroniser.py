@@ -62,11 +62,9 @@ class Synchroniser:
         self._expected = frozenset(expected)
         self._strict = policy == "strict"
         self._queues = RigQueues(fps)
-        self._policy = (
-            LatestPolicy(self._queues, max_spread_ns)
-            if policy == "latest"
-            else WaitingPolicy(self._queues, deadline_ns, max_spread_ns, strict=self._strict)
-        )
+        self._latest = policy == "latest"
+        self._deadline_ns, self._max_spread_ns = deadline_ns, max_spread_ns
+        self._policy = self._make_policy()
         self._index = 0
         self._stirred = False  # something came that may make a set
 
@@ -104,6 +102,9 @@ class Synchroniser:
 
     def add(self, frame: RgbdFrame, now_ns: int) -> None:
         """Take a frame stamped in rig time; what comes too late or is implausible is counted."""
+        if self._queues.is_ahead_of(now_ns + _MAX_AHEAD_NS):
+            self._queues.begin_anew()
+            self._policy = self._make_policy()
         queue = self._queues[frame.camera_id]
         if frame.timestamp_ns > now_ns + _MAX_AHEAD_NS or queue.holds(frame.timestamp_ns):
             self.counters.implausible += 1
@@ -140,6 +141,11 @@ class Synchroniser:
         """When a frame that waits has waited long enough; None when none waits."""
         oldest_ns = self._queues.oldest_arrival_ns
         return None if oldest_ns is None else oldest_ns + self._policy.longest_wait_ns
+
+    def _make_policy(self) -> LatestPolicy | WaitingPolicy:
+        if self._latest:
+            return LatestPolicy(self._queues, self._max_spread_ns)
+        return WaitingPolicy(self._queues, self._deadline_ns, self._max_spread_ns, strict=self._strict)
 
     def _may_complete(self, queue: CameraQueue) -> bool:
         """Whether this camera's frame is worth a look: the next set waits for it, or its queue is full."""

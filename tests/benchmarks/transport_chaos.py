@@ -75,7 +75,8 @@ class ServerProcess:
             found = self._changed.wait_for(lambda: self._steady(start_s) is not None, PATIENCE_S)
             steady_s = self._steady(start_s)
         if not found or steady_s is None:
-            raise SystemExit(f"no whole sets within {PATIENCE_S:.0f} s; the last status: {self.status}")
+            missing = self.status.get("often_missing")
+            raise SystemExit(f"no whole sets within {PATIENCE_S:.0f} s; often missing: {missing}")
         return steady_s
 
     def incomplete_since(self, start_s: float) -> int:

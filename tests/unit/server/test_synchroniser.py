@@ -296,3 +296,24 @@ def test_no_set_is_wider_than_one_frame_period_under_loss_and_jitter(
     ]
     for _, panorama in run(joined(range(len(phases))), arrivals):
         assert panorama.spread_ns <= PERIOD_NS
+
+
+@pytest.mark.parametrize("policy", ["partial", "strict", "latest"])
+def test_a_rig_clock_that_is_set_back_an_hour_costs_the_frames_that_waited_and_no_more(
+    policy: Policy,
+) -> None:
+    synchroniser = Synchroniser(range(2), deadline_ns=DEADLINE_NS, policy=policy)
+    for camera_id in range(2):
+        synchroniser.camera_joined(camera_id, 30.0)
+    hour_ns, interval_ns = 3_600 * 10**9, 33_333_333
+    whole = []
+    for start_ns in (2 * hour_ns, hour_ns):
+        for k in range(5):
+            time_ns = start_ns + k * interval_ns
+            for camera_id in range(2):
+                synchroniser.add(
+                    RgbdFrame(camera_id, k, time_ns + camera_id * 1_000_000), time_ns + 5_000_000
+                )
+            while (panorama := synchroniser.next_panorama(time_ns + 5_000_000)) is not None:
+                whole.append(panorama.complete)
+    assert whole.count(True) >= 9
