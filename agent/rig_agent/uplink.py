@@ -61,6 +61,7 @@ class Uplink:
         self._reopen_ns = 0
         self._refusal = ""
         self._rate = 1.0  # bytes a second that the kernel may send
+        self._resent_before = 0  # by the links of cameras that were introduced before
         self.connections = 0
         self.unheard = 0
 
@@ -94,7 +95,7 @@ class Uplink:
     @property
     def resent(self) -> int:
         """Datagrams that the server asked for again."""
-        return 0 if self._link is None else self._link.counters.resent
+        return self._resent_before + (0 if self._link is None else self._link.counters.resent)
 
     @property
     def network_errors(self) -> int:
@@ -193,6 +194,7 @@ class Uplink:
         self._link.close(now_ns)
         for datagram in self._link.datagrams_to_send(now_ns):
             self._transport.send_datagram(datagram)
+        self._resent_before += self._link.counters.resent
         self._link = None
 
     def _report(self, event: AgentEvent) -> None:

@@ -8,7 +8,14 @@ import pytest
 from rig_calib.evaluation import evaluate
 from rig_calib.rig_calibration import RigCalibration
 from rig_protocol.rig_folder import read_true_poses
-from support.rig_processes import LOOPBACK, folder_agents, free_port, run_program, write_small_rig
+from support.rig_processes import (
+    LOOPBACK,
+    folder_agents,
+    free_port,
+    rig_key_file,
+    run_program,
+    write_small_rig,
+)
 
 
 def test_a_camera_that_never_comes_is_named(tmp_path: Path) -> None:
@@ -16,7 +23,7 @@ def test_a_camera_that_never_comes_is_named(tmp_path: Path) -> None:
     port = free_port()
     config = tmp_path / "rig.toml"
     config.write_text(
-        f'listen = "{LOOPBACK}:{port}"\n[capture]\nwait_s = 8.0\n'
+        f'listen = "{LOOPBACK}:{port}"\nkey_file = "{rig_key_file()}"\n[capture]\nwait_s = 8.0\n'
         '[[cameras]]\nid = 0\n[[cameras]]\nid = 1\nname = "window"\n'
     )
     with folder_agents(tmp_path / "rig", tmp_path, port, [0]):
@@ -33,7 +40,10 @@ def test_a_camera_that_never_comes_is_named(tmp_path: Path) -> None:
         ("rig_server.cli", ["--config", "absent.toml"], "absent.toml"),
         ("rig_server.cli", ["--listen", "nowhere:port"], "nowhere:port"),
         ("rig_agent.cli", ["--source", "webcam"], "webcam"),
-        ("rig_agent.cli", ["--source", "folder", "--path", "absent", "--camera", 0], "absent"),
+        ("rig_agent.cli", ["--source", "folder", "--path", "absent", "--camera", 0, "--insecure"], "absent"),
+        ("rig_agent.cli", ["--source", "folder", "--key-file", "absent.key"], "absent.key"),
+        ("rig_server.cli", ["--calibrate", "--insecure", "--config", "key.toml"], "drop one"),
+        ("rig_server.cli", ["keygen", "--path", "absent/rig.key"], "absent/rig.key"),
         ("rig_agent.cli", ["--source", "folder", "--fps", -1], "fps"),
         ("rig_calib.cli", ["solve", "absent", "--out", "out"], "absent"),
         ("rig_calib.cli", ["evaluate", "absent.json", "absent.json"], "absent.json"),
@@ -43,6 +53,7 @@ def test_a_wrong_option_ends_with_2_and_says_which(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, module: str, options: list[object], told: str
 ) -> None:
     monkeypatch.chdir(tmp_path)
+    Path("key.toml").write_text('key_file = "rig.key"')
     done = run_program(module, *options)
     assert done.returncode == 2, done.stderr
     assert told in done.stderr

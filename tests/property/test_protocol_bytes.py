@@ -8,6 +8,7 @@ import msgpack
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from rig_protocol.clear_datagram import clear_crc, encode_clear
 from rig_protocol.clock_sync import ClockSync
 from rig_protocol.counters import CameraCounters
 from rig_protocol.datagram import (
@@ -20,30 +21,34 @@ from rig_protocol.datagram import (
     pack_fragment_header,
     pack_prefix,
     parse_fragment_header,
-    parse_prefix,
 )
 from rig_protocol.errors import DataError
 from rig_protocol.events import FrameReceived
 from rig_protocol.fragmenter import fragment
-from rig_protocol.frame_unit import MAX_UNIT_SIZE, parse_unit
+from rig_protocol.frame_unit import MAX_SEALED_SIZE, MIN_SEALED_SIZE, parse_unit
 from rig_protocol.frames import EncodedFrame, Payload
-from rig_protocol.message_bytes import control_crc, decode_message, encode_message
+from rig_protocol.message_bytes import decode_body, encode_body
 from rig_protocol.messages import ClockReply
 from rig_protocol.reassembler import MAX_OPEN_UNITS, Reassembler
+from rig_protocol.security import hello_aead, seal_once
+from support.peers import AgentPeer, ServerPeer
 from support.wire import (
     AGENT,
+    KEY,
     OTHER,
     T0,
     events_of,
     make_agent,
     make_frame,
     make_hello,
+    make_seal,
     make_server,
     roundtrip,
 )
 
 examples = settings(deadline=None, derandomize=True, max_examples=150)
 
+SEAL = make_seal()
 U64 = st.integers(0, 2**64 - 1)
 I64 = st.integers(-(2**63), 2**63 - 1)
 ANYTHING = st.recursive(
@@ -51,19 +56,19 @@ ANYTHING = st.recursive(
     lambda inner: st.lists(inner, max_size=5) | st.dictionaries(st.text(max_size=8), inner, max_size=5),
     max_leaves=20,
 )
-HELLO_VALUES: dict[str, Any] = msgpack.unpackb(encode_message(make_hello(), 1)[16:])
+HELLO_VALUES: dict[str, Any] = msgpack.unpackb(encode_body(make_hello())[1])
 
 
 def with_crc(datagram: bytes) -> bytes:
     """The datagram with the crc that it should have, so that what stands behind the crc is reached."""
-    return datagram[:4] + control_crc(datagram).to_bytes(4, "little") + datagram[8:]
+    return datagram[:4] + clear_crc(datagram).to_bytes(4, "little") + datagram[8:]
 
 
 @st.composite
 def datagrams(draw: st.DrawFn, id_: int) -> bytes:
     """Bytes that look like the protocol's to every depth: from noise to a right crc over a wild body."""
     kind = draw(st.sampled_from([*MessageType, 0, 99]))
-    version = draw(st.sampled_from([VERSION, VERSION, VERSION, 0, 2, 255]))
+    version = draw(st.sampled_from([VERSION, VERSION, VERSION, 0, 1, 255]))
     body = draw(st.binary(max_size=600) | st.builds(msgpack.packb, ANYTHING))
     start = (
         MAGIC + bytes((version, kind)) + bytes(4) + draw(st.sampled_from([id_, id_, 7])).to_bytes(8, "little")
@@ -86,8 +91,9 @@ def test_nothing_escapes_the_server_and_no_answer_is_longer_than_its_cause(data:
         server.receive_datagram(datagram, address, T0)
         for answer, to in server.datagrams_to_send(T0):
             assert to in (AGENT, OTHER)
-            assert len(answer) <= max(len(datagram), 24)  # 24: a clock request of the session
+            assert len(answer) <= len(datagram)
         server.handle_timeout(T0)
+        server.datagrams_to_send(T0)  # what time brings: clock requests and resends of the session
         events_of(server)
 
 
@@ -104,17 +110,51 @@ def test_nothing_escapes_the_agent(data: st.DataObject, connected: bool) -> None
         agent.datagrams_to_send(T0)
         agent.handle_timeout(T0)
         agent.send_frame(make_frame(size=10), T0)
+        agent.frames_to_resend(len)
         events_of(agent)
 
 
+FROM_AGENT = [MessageType.GOODBYE, MessageType.HEARTBEAT, MessageType.CLOCK_REPLY]
+FROM_SERVER = [MessageType.GOODBYE, MessageType.CLOCK_REQUEST, MessageType.RESEND, MessageType.PLAN]
+BODIES = st.binary(max_size=300) | st.builds(msgpack.packb, ANYTHING)
+
+
 @examples
-@given(st.sampled_from([kind for kind in MessageType if kind is not MessageType.FRAGMENT]), ANYTHING)
-def test_any_structure_is_a_message_or_malformed(kind: MessageType, values: Any) -> None:
-    datagram = pack_prefix(kind, 0, 1) + msgpack.packb(values)
-    prefix = parse_prefix(datagram)
-    assert prefix is not None
+@given(st.lists(st.tuples(st.sampled_from(FROM_AGENT), BODIES), max_size=6))
+def test_no_authentic_agent_brings_down_the_server(said: list[tuple[MessageType, bytes]]) -> None:
+    server, agent = make_server(), AgentPeer()
+    server.receive_datagram(agent.hello, AGENT, T0)
+    agent.accept(server.datagrams_to_send(T0)[0][0])
+    for now_ns, (kind, body) in enumerate(said, start=T0):
+        server.receive_datagram(agent.seal_body(kind, body), AGENT, now_ns)
+        server.handle_timeout(now_ns)
+        server.datagrams_to_send(now_ns)
+        events_of(server)
+
+
+@examples
+@given(st.lists(st.tuples(st.sampled_from(FROM_SERVER), BODIES), max_size=6))
+def test_no_authentic_server_brings_down_the_agent_or_makes_it_send_more_than_its_budget(
+    said: list[tuple[MessageType, bytes]],
+) -> None:
+    server, agent = ServerPeer(), make_agent()
+    agent.receive_datagram(server.welcome(agent.datagrams_to_send(T0)[0]), T0)
+    sent_again = 0
+    for now_ns, (kind, body) in enumerate(said, start=T0):
+        agent.receive_datagram(server.seal_body(kind, body), now_ns)
+        agent.send_frame(make_frame(), now_ns)
+        sent_again += sum(map(len, agent.frames_to_resend(len)))
+        agent.handle_timeout(now_ns)
+        agent.datagrams_to_send(now_ns)
+        events_of(agent)
+    assert sent_again <= 3 * (1 + len(said))
+
+
+@examples
+@given(st.sampled_from([kind for kind in MessageType if kind is not MessageType.FRAGMENT]), BODIES)
+def test_any_structure_is_a_message_or_malformed(kind: MessageType, body: bytes) -> None:
     with suppress(DataError):
-        decode_message(prefix, datagram)
+        decode_body(kind, body)
 
 
 @examples
@@ -129,9 +169,11 @@ def test_a_hello_with_any_value_replaced_is_a_message_or_malformed(data: st.Data
             break
         place = place[key]
     place[key] = data.draw(ANYTHING)
-    server = make_server()
-    server.receive_datagram(with_crc(pack_prefix(MessageType.HELLO, 0, 1) + msgpack.packb(values)), AGENT, T0)
-    assert len(server.datagrams_to_send(T0)) <= 2
+    public, server = bytes(range(32)), make_server()
+    associated = pack_prefix(MessageType.HELLO, 0, 1) + public
+    sealed = seal_once(hello_aead(KEY, public), msgpack.packb(values), associated)
+    server.receive_datagram(encode_clear(MessageType.HELLO, public + sealed, 1), AGENT, T0)
+    assert len(server.datagrams_to_send(T0)) <= 1
 
 
 @st.composite
@@ -155,21 +197,23 @@ def frames(draw: st.DrawFn) -> EncodedFrame:
 def test_a_frame_survives_any_order_with_repetitions(
     frame: EncodedFrame, session_id: int, number: int, datagram_size: int, data: st.DataObject
 ) -> None:
-    sent = [bytes(datagram) for datagram in fragment(frame, session_id, datagram_size, number)]
+    sent = [bytes(datagram) for datagram in fragment(frame, session_id, number, SEAL, datagram_size)]
     order = data.draw(st.permutations(range(len(sent))))
     repeated = data.draw(st.lists(st.sampled_from(range(len(sent))), max_size=4))
-    delivered = feed(
-        Reassembler(0, 30.0, CameraCounters()), [sent[k] for k in [*repeated, *order, *repeated]]
-    )
+    delivered = feed(make_reassembler(), [sent[k] for k in [*repeated, *order, *repeated]])
     assert delivered == [frame]
 
 
-def feed(reassembler: Reassembler, datagrams_: list[bytes]) -> list[EncodedFrame]:
+def make_reassembler() -> Reassembler:
+    return Reassembler(0, 30.0, CameraCounters(), SEAL)
+
+
+def feed(reassembler: Reassembler, datagrams_: list[bytes], now_ns: int = 0) -> list[EncodedFrame]:
     """Frames that come out when datagrams go in one by one."""
     delivered = []
     for datagram in datagrams_:
         header = parse_fragment_header(datagram)
-        frame = None if header is None else reassembler.receive(header, datagram, 1, 0)
+        frame = None if header is None else reassembler.receive(header, datagram, 1, now_ns)
         if frame is not None:
             delivered.append(frame)
     return delivered
@@ -211,24 +255,41 @@ def test_altered_bytes_never_become_an_accepted_altered_frame(data: st.DataObjec
 
 HEADERS = st.builds(
     FragmentHeader,
-    frame_crc=st.integers(0, 3),
+    seal=st.integers(0, 3),
     session_id=st.just(1),
     frame_number=st.integers(0, 40) | U64,
-    unit_size=st.sampled_from([0, 1, 32, 100, 1441, MAX_UNIT_SIZE, MAX_UNIT_SIZE + 1, 2**32 - 1]),
-    payload_size=st.sampled_from([0, 1, 68, 1440, 65535]),
+    unit_size=st.sampled_from(
+        [
+            0,
+            1,
+            MIN_SEALED_SIZE - 1,
+            MIN_SEALED_SIZE,
+            100,
+            1441,
+            MAX_SEALED_SIZE,
+            MAX_SEALED_SIZE + 1,
+            2**32 - 1,
+        ]
+    ),
+    payload_size=st.sampled_from([0, 1, 32, 33, 68, 1440, 65535]),
     fragment_index=st.integers(0, 3) | st.integers(0, 65535),
 )
 
 
 @examples
-@given(st.lists(st.tuples(HEADERS, st.sampled_from([0, 1, 31, 32, 68, 100, 1440])), max_size=60))
+@given(st.lists(st.tuples(HEADERS, st.sampled_from([0, 1, 31, 32, 33, 48, 68, 100, 1440])), max_size=60))
 def test_any_headers_leave_the_reassembler_within_its_bounds(items: list[tuple[FragmentHeader, int]]) -> None:
-    reassembler = Reassembler(0, 30.0, CameraCounters())
-    for now_ns, (header, size) in enumerate(items):
-        feed(reassembler, [pack_fragment_header(header) + bytes(size)])
-        reassembler.expire(now_ns)
+    reassembler = make_reassembler()
+    for k, (header, size) in enumerate(items):
+        now_ns = k * 700_000
+        feed(reassembler, [pack_fragment_header(header) + bytes(size)], now_ns)
+        if reassembler.due_ns <= now_ns:
+            for request in reassembler.handle_timeout(now_ns):
+                encode_body(request)  # raises where it could not be sent
+        assert reassembler.due_ns > now_ns
         assert len(reassembler._open) <= MAX_OPEN_UNITS
-        assert sum(len(unit.content) for unit in reassembler._open.values()) <= MAX_OPEN_UNITS * MAX_UNIT_SIZE
+        held = [len(unit.content) for unit in reassembler._open.values()]
+        assert sum(held) <= MAX_OPEN_UNITS * MAX_SEALED_SIZE
 
 
 @examples

@@ -191,6 +191,58 @@ def test_thinning_to_an_odd_rate_keeps_it_on_average(start: Start) -> None:
     assert capture.counters.captured == 201
 
 
+@pytest.mark.parametrize(
+    ("max_fps", "wanted_fps", "kept"),
+    [
+        (None, 15.0, range(0, 12, 2)),
+        (None, 60.0, range(12)),
+        (10.0, 15.0, range(0, 12, 3)),
+        (15.0, 10.0, range(0, 12, 3)),
+    ],
+)
+def test_the_slower_of_what_the_operator_and_what_the_server_wants_counts(
+    max_fps: float | None, wanted_fps: float, kept: range
+) -> None:
+    recorder = Recorder()
+    capture = Capture(
+        lambda: ScriptedSource(frames(*range(12))),
+        max_fps,
+        recorder.count_opened,
+        recorder.frames.put,
+        recorder.failures.put,
+    )
+    capture.wanted_fps = wanted_fps
+    capture.start()
+    taken = recorder.take(len(kept))
+    assert capture.stop(5.0)
+    assert [frame.timestamp_ns for frame in taken] == [INTERVAL_NS * n for n in kept]
+    assert [frame.sequence for frame in taken] == list(range(len(kept)))
+
+
+def test_what_the_server_wants_may_change_amid_the_stream() -> None:
+    capture: Capture
+
+    class Wanting(ScriptedSource):
+        def read(self, timeout_s: float) -> RgbdFrame | None:
+            frame = super().read(timeout_s)
+            if frame is not None and frame.sequence % 30 == 0:
+                capture.wanted_fps = {0: None, 30: 15.0, 60: 30.0}[frame.sequence]
+            return frame
+
+    recorder = Recorder()
+    capture = Capture(
+        lambda: Wanting(frames(*range(90))),
+        None,
+        recorder.count_opened,
+        recorder.frames.put,
+        recorder.failures.put,
+    )
+    capture.start()
+    taken = [round(frame.timestamp_ns / INTERVAL_NS) for frame in recorder.take(75)]
+    assert capture.stop(5.0)
+    assert taken == [*range(30), *range(30, 60, 2), *range(60, 90)]
+
+
 def test_a_full_queue_drops_the_oldest_and_counts_it() -> None:
     queue: FrameQueue[int] = FrameQueue(2)
     for item in range(5):

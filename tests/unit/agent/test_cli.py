@@ -43,6 +43,30 @@ def test_flags_override_the_file(streamed: list[AgentSettings]) -> None:
     assert (settings.synthetic.seed, settings.synthetic.cameras) == (9, 6)
 
 
+def test_the_key_is_named_or_gone_without(streamed: list[AgentSettings]) -> None:
+    invoke("--source", "synthetic", "--key-file", "my.key")
+    invoke("--source", "synthetic", "--insecure")
+    invoke("--source", "synthetic")
+    assert [(settings.key_file, settings.insecure) for settings in streamed] == [
+        (Path("my.key"), False),
+        (None, True),
+        (None, False),
+    ]
+
+
+def test_an_agent_without_a_key_ends_with_status_2_and_is_told_how_to_get_one(tmp_path: Path) -> None:
+    key = tmp_path / "rig.key"
+    key.write_text("not a key")
+    key.chmod(0o644)
+    words = ["--source", "synthetic", "--camera", "0", "--key-file", str(key)]
+    done = subprocess.run(
+        [sys.executable, "-m", "rig_agent.cli", *words], capture_output=True, text=True, timeout=60
+    )
+    assert done.returncode == 2
+    assert f"chmod 600 {key}" in done.stderr
+    assert "Traceback" not in done.stderr
+
+
 def test_a_folders_camera_may_be_named(streamed: list[AgentSettings]) -> None:
     invoke("--source", "folder", "--path", "rig", "--camera", "left")
     (settings,) = streamed

@@ -1,41 +1,53 @@
 """Rules of the uplink that need no server: virtual time, a transport that only remembers."""
 
+from dataclasses import replace
+
 import pytest
 
 from rig_agent import uplink as uplink_module
-from rig_agent.config import AgentSettings
+from rig_agent.config import AgentSettings, PacingSettings
 from rig_agent.hello import make_hello
 from rig_agent.sources.base import SourceDescription
 from rig_agent.transport import TransportCounters
-from rig_agent.uplink import Uplink
+from rig_agent.uplink import Uplink, Wanted
 from rig_protocol.camera import CameraModel
 from rig_protocol.datagram import DatagramBatch
 from rig_protocol.frames import EncodedFrame
+from rig_protocol.messages import WHOLE_FRAME, ClockRequest, Goodbye, Resend, StreamPlan
 from rig_protocol.rig_key import RigKey
+from support.peers import ServerPeer
+from support.wire import COLOR, DEPTH, KEY, make_frame
 
 SECOND_NS = 1_000_000_000
 SETTINGS = AgentSettings(camera=0)
 HELLO = make_hello(SETTINGS, SourceDescription(None, None, CameraModel(), 30.0, "bayer", "raw"))
 
 
-class DeadTransport:
-    """A network that takes everything and answers nothing."""
+class MemoryTransport:
+    """A network that takes everything, and brings what a test lays into `arrived`."""
 
     def __init__(self, _server: object) -> None:
         self.counters = TransportCounters()
         self.opened = 0
         self.network = True
         self.sent: list[bytes] = []
+        self.fragments: list[bytes] = []
+        self.arrived: list[bytes] = []
 
     def open(self) -> bool:
         self.opened += 1
         return self.network
 
     def receive(self) -> list[bytes]:
-        return []
+        arrived, self.arrived = self.arrived, []
+        return arrived
 
     def send(self, batch: DatagramBatch) -> int:
+        self.fragments += [bytes(datagram) for datagram in batch]
         return len(batch)
+
+    def server_reached(self) -> None:
+        return
 
     def send_datagram(self, data: bytes) -> None:
         self.sent.append(data)
@@ -48,8 +60,8 @@ class DeadTransport:
 
 
 @pytest.fixture
-def transport(monkeypatch: pytest.MonkeyPatch) -> DeadTransport:
-    dead = DeadTransport(None)
+def transport(monkeypatch: pytest.MonkeyPatch) -> MemoryTransport:
+    dead = MemoryTransport(None)
     monkeypatch.setattr(uplink_module, "Transport", lambda _server: dead)
     return dead
 
@@ -63,7 +75,7 @@ def serve_until(uplink: Uplink, end_ns: int) -> None:
         now_ns = None if due_ns is None else max(due_ns, now_ns + 1)
 
 
-def test_nothing_happens_before_the_introduction(transport: DeadTransport) -> None:
+def test_nothing_happens_before_the_introduction(transport: MemoryTransport) -> None:
     uplink = Uplink(SETTINGS, RigKey.INSECURE)
     uplink.serve(0)
     assert uplink.next_timeout_ns() is None
@@ -71,7 +83,7 @@ def test_nothing_happens_before_the_introduction(transport: DeadTransport) -> No
 
 
 def test_an_unreachable_server_hears_hellos_and_its_name_is_looked_up_every_five_seconds(
-    transport: DeadTransport,
+    transport: MemoryTransport,
 ) -> None:
     uplink = Uplink(SETTINGS, RigKey.INSECURE)
     uplink.introduce(HELLO, 0)
@@ -80,7 +92,7 @@ def test_an_unreachable_server_hears_hellos_and_its_name_is_looked_up_every_five
     assert 20 <= len(transport.sent) <= 30
 
 
-def test_without_a_network_the_way_out_is_tried_every_second(transport: DeadTransport) -> None:
+def test_without_a_network_the_way_out_is_tried_every_second(transport: MemoryTransport) -> None:
     transport.network = False
     uplink = Uplink(SETTINGS, RigKey.INSECURE)
     uplink.introduce(HELLO, 0)
@@ -96,9 +108,130 @@ def test_frames_are_not_queued_while_nobody_listens() -> None:
     assert (uplink.sent, uplink.dropped, uplink.unheard, uplink.welcome) == (0, 0, 1, None)
 
 
-def test_closing_without_a_session_is_silent(transport: DeadTransport) -> None:
+def test_closing_without_a_session_is_silent(transport: MemoryTransport) -> None:
     uplink = Uplink(SETTINGS, RigKey.INSECURE)
     uplink.introduce(HELLO, 0)
     uplink.close(0)
     assert transport.sent == []
     assert uplink.next_timeout_ns() is None
+
+
+# ---- with a server
+
+
+def connected(transport: MemoryTransport, uplink: Uplink) -> ServerPeer:
+    """A server that has welcomed the agent."""
+    server = ServerPeer(RigKey.INSECURE)
+    transport.arrived.append(server.welcome(transport.sent[-1], color_codecs=(COLOR, COLOR + 1), camera_id=4))
+    uplink.serve(0)
+    transport.arrived.append(server.seal(ClockRequest(0)))
+    uplink.serve(0)
+    assert uplink.connections == 1
+    return server
+
+
+@pytest.fixture
+def uplink(transport: MemoryTransport) -> Uplink:
+    """Introduced, its hello sent, its pace not spread."""
+    quick = SETTINGS.model_copy(update={"pacing": PacingSettings(spread=0.0)})
+    uplink = Uplink(quick, RigKey.INSECURE)
+    uplink.introduce(HELLO, 0)
+    uplink.serve(0)
+    assert transport.sent
+    return uplink
+
+
+PLAN = StreamPlan(COLOR + 1, None, 15.0, 1_000_000, 250_000)
+
+
+def test_before_any_plan_the_first_codecs_of_the_welcome_are_wanted_at_full_rate(
+    transport: MemoryTransport, uplink: Uplink
+) -> None:
+    assert uplink.wanted is None
+    connected(transport, uplink)
+    assert uplink.wanted == Wanted(4, COLOR, DEPTH, None)
+
+
+def test_a_plan_says_what_is_wanted_and_the_next_one_replaces_it(
+    transport: MemoryTransport, uplink: Uplink
+) -> None:
+    server = connected(transport, uplink)
+    for plan in (PLAN, replace(PLAN, color_codec=COLOR, depth_codec=DEPTH, fps=30.0)):
+        transport.arrived.append(server.seal(plan))
+        uplink.serve(0)
+        assert uplink.wanted == Wanted(4, plan.color_codec, plan.depth_codec, plan.fps)
+
+
+def test_frames_leave_on_the_grid_of_the_plan_and_in_its_interval(transport: MemoryTransport) -> None:
+    uplink = Uplink(SETTINGS, RigKey.INSECURE)
+    uplink.introduce(HELLO, 0)
+    uplink.serve(0)
+    server = connected(transport, uplink)
+    transport.arrived.append(server.seal(PLAN))
+    uplink.serve(1)
+    uplink.send_frame(make_frame(size=200_000, color=None), 1)
+    times, now_ns = [], 1
+    while uplink.sent == 0:
+        before = len(transport.fragments)
+        due_ns = uplink.next_timeout_ns()
+        assert due_ns is not None
+        now_ns = max(now_ns, due_ns)
+        uplink.serve(now_ns)
+        times += [now_ns] * (len(transport.fragments) > before)
+    assert {time_ns % 1_000_000 for time_ns in times} == {250_000}
+    # 47 fragments over 0.8 of the 66.7 ms between frames at 15 a second, one a step.
+    assert 40_000_000 < times[-1] < 0.8 * SECOND_NS / 15
+
+
+def test_what_the_server_missed_is_sent_again(transport: MemoryTransport, uplink: Uplink) -> None:
+    server = connected(transport, uplink)
+    uplink.send_frame(make_frame(), 0)
+    serve_until(uplink, 1_000_000)
+    first = list(transport.fragments)
+    transport.arrived.append(server.seal(Resend(0, ((1, 1),))))
+    uplink.serve(2_000_000)
+    assert transport.fragments == [*first, first[1]]
+    assert uplink.resent == 1
+    uplink.introduce(HELLO, 3_000_000)
+    assert uplink.resent == 1
+
+
+def test_a_frame_given_up_for_a_newer_one_is_not_sent_again(
+    transport: MemoryTransport, uplink: Uplink
+) -> None:
+    server = connected(transport, uplink)
+    for _ in range(3):  # nothing is served in between: of the first two, none has begun
+        uplink.send_frame(make_frame(), 0)
+    assert uplink.dropped == 2
+    serve_until(uplink, 1_000_000)
+    sent = len(transport.fragments)
+    transport.arrived.append(server.seal(Resend(0, WHOLE_FRAME)))
+    transport.arrived.append(server.seal(Resend(1, WHOLE_FRAME)))
+    serve_until(uplink, 10_000_000)
+    assert len(transport.fragments) == sent
+
+
+def test_a_lost_session_drops_what_is_unsent_and_its_plan(transport: MemoryTransport, uplink: Uplink) -> None:
+    server = connected(transport, uplink)
+    transport.arrived.append(server.seal(PLAN))
+    uplink.serve(0)
+    uplink.send_frame(make_frame(color=None), 0)
+    transport.arrived.append(server.seal(Goodbye("the server stops")))
+    uplink.serve(0)
+    assert (uplink.wanted, uplink.dropped, transport.fragments) == (None, 1, [])
+    connected_again = ServerPeer(RigKey.INSECURE, seed=9)
+    transport.arrived.append(connected_again.welcome(transport.sent[-1]))
+    uplink.serve(0)
+    transport.arrived.append(connected_again.seal(ClockRequest(0)))
+    uplink.serve(0)
+    assert uplink.wanted == Wanted(4, COLOR, DEPTH, None)
+
+
+def test_a_server_with_another_key_gets_no_frame(transport: MemoryTransport, uplink: Uplink) -> None:
+    impostor = ServerPeer(KEY)
+    transport.arrived.append(impostor.welcome(transport.sent[-1]))
+    transport.arrived.append(impostor.seal(ClockRequest(0)))
+    uplink.serve(0)
+    uplink.send_frame(make_frame(), 0)
+    serve_until(uplink, SECOND_NS)
+    assert (uplink.connections, uplink.unheard, transport.fragments) == (0, 1, [])
