@@ -3,8 +3,9 @@ PYTHON ?= python3
 VENV   := .venv
 BIN    := $(VENV)/bin
 READY  := $(VENV)/.ready
+BENCH  := $(VENV)/.ready-bench
 
-.PHONY: demo test lint bench-codecs docs clean
+.PHONY: demo test lint bench bench-codecs bench-transport soak fuzz docs clean
 
 demo: $(READY)  ## twelve simulated Kinects over loopback UDP, calibrated and fused into build/demo
 	$(BIN)/rig-server --calibrate --simulate 12 --frames 5 --out build/demo
@@ -21,15 +22,37 @@ lint: $(READY)  ## style, types, import rules
 bench-codecs: $(READY)  ## sizes and times of the codecs, into docs/performance.md
 	$(BIN)/python tests/benchmarks/bench_codecs.py
 
+soak: $(READY)  ## ten minutes of killed programs, pulled cables, clock steps and floods: SOAK_MINUTES=10
+	$(BIN)/python tests/benchmarks/transport_chaos.py --soak $(or $(SOAK_MINUTES),10)
+
+fuzz: $(VENV)/.ready-fuzz  ## every parser of strangers' bytes, 100 s each: FUZZ_SECONDS=100
+	for target in server_link agent_link bodies units codecs key_files; do \
+	    $(BIN)/python tests/fuzz/fuzz_parsers.py $$target -max_total_time=$(or $(FUZZ_SECONDS),100) || exit 1; \
+	done
+
+bench-transport: $(BENCH)  ## the transport against its bars and its peers, into docs/performance.md
+	$(BIN)/python tests/benchmarks/bench_transport.py
+
+bench: bench-codecs bench-transport  ## all figures, into build/bench.json
+
 docs: $(READY)  ## the pages that are made from the code
 	$(BIN)/python docs/generate_configuration.py
+	$(BIN)/python docs/generate_monitoring.py
 
 clean:  ## everything that make built
 	rm -rf $(VENV) build
+
+$(VENV)/.ready-%: $(READY)
+	$(BIN)/python -m pip install --quiet --constraint requirements.lock --editable '.[$*]'
+	touch $@
 
 # The lock file pins what was tested; the stamp is newer than everything it was made from.
 $(READY): pyproject.toml requirements.lock
 	$(PYTHON) -m venv $(VENV)
 	$(BIN)/python -m pip install --quiet --upgrade pip
 	$(BIN)/python -m pip install --quiet --constraint requirements.lock --editable '.[dev]'
+	touch $@
+
+$(BENCH): $(READY)
+	$(BIN)/python -m pip install --quiet --constraint requirements.lock --editable '.[bench]'
 	touch $@

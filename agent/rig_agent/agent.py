@@ -8,6 +8,7 @@ import logging
 import os
 import select
 import threading
+import time
 from collections.abc import Callable
 from dataclasses import fields, replace
 
@@ -25,6 +26,7 @@ from rig_protocol.errors import RigError
 from rig_protocol.frames import EncodedFrame, RgbdFrame
 from rig_protocol.messages import Hello
 from rig_protocol.rig_key import RigKey
+from rig_protocol.system_clock import SystemClock
 
 _log = logging.getLogger(__name__)
 
@@ -49,7 +51,7 @@ class Agent:
             open_source, settings.fps, self._source_opened, self._captured.put, self._fail
         )
         self._encoder = threading.Thread(target=self._encode_frames, name="encoder", daemon=True)
-        self._uplink = Uplink(settings, rig_key)
+        self._uplink = Uplink(settings, rig_key, SystemClock(now_ns, time.time_ns).read)
         self._hello: Hello | None = None  # of the source that is open now
         self._introduced: Hello | None = None
         self._wanted: Wanted | None = None  # what the encoder encodes for; None: nobody listens
@@ -131,7 +133,8 @@ class Agent:
         # Control first: cutting a frame takes a millisecond, which the clock exchange would feel.
         self._uplink.serve(time_ns)
         self._wanted = self._uplink.wanted
-        self._capture.wanted_fps = None if self._wanted is None else self._wanted.fps
+        if self._wanted is not None:
+            self._capture.want(self._wanted.fps, self._wanted.rig_offset_ns)
         while (frame := self._encoded.get()) is not None:
             self._uplink.send_frame(frame, time_ns)
 

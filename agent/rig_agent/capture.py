@@ -44,7 +44,7 @@ class Capture:
         """Frames beyond `max_fps` are left out evenly."""
         self._open_source = open_source
         self._max_fps = max_fps
-        self.wanted_fps: float | None = None  # what the server wants; set from any thread
+        self._wanted: tuple[float | None, int] = None, 0
         self._on_open, self._on_frame, self._on_failure = on_open, on_frame, on_failure
         self._stopping = threading.Event()
         # A daemon: a driver that hangs must not keep the program from ending.
@@ -59,6 +59,10 @@ class Capture:
     def start(self) -> None:
         """Start the thread."""
         self._thread.start()
+
+    def want(self, max_fps: float | None, rig_offset_ns: int) -> None:
+        """What the server wants, from any thread; rig time is agent time and `rig_offset_ns`."""
+        self._wanted = max_fps, rig_offset_ns
 
     def stop(self, timeout_s: float) -> bool:
         """Close the source; False when the driver did not come back in time."""
@@ -90,7 +94,7 @@ class Capture:
         with self._open_source() as source:
             description = source.describe()
             self._on_open(description)
-            wanted = _Thinning(description.fps)
+            wanted = _Thinning()
             offset: int | None = None
             counted_before = Counter(self.source_counters)
             while not self._stopping.is_set():
@@ -101,13 +105,15 @@ class Capture:
                     continue
                 if offset is None:  # a source that was opened again counts on where the last one ended
                     offset = self._next_sequence - frame.sequence
-                if wanted.accepts(frame.timestamp_ns, self._limit_fps(description.fps)):
+                if self._is_wanted(wanted, frame.timestamp_ns, description.fps):
                     self._deliver(replace(frame, sequence=frame.sequence + offset))
                 else:  # left out on purpose: no gap in the count, which tells of frames that were lost
                     offset -= 1
 
-    def _limit_fps(self, source_fps: float) -> float:
-        return min(self._max_fps or source_fps, self.wanted_fps or source_fps)
+    def _is_wanted(self, thinning: "_Thinning", timestamp_ns: int, source_fps: float) -> bool:
+        wanted_fps, rig_offset_ns = self._wanted
+        max_fps = min(self._max_fps or source_fps, wanted_fps or source_fps)
+        return max_fps >= source_fps or thinning.accepts(timestamp_ns + rig_offset_ns, max_fps)
 
     def _deliver(self, frame: RgbdFrame) -> None:
         self._next_sequence = frame.sequence + 1
@@ -117,21 +123,15 @@ class Capture:
 
 
 class _Thinning:
-    """Lets every frame of a source pass that is no faster than wanted, else the nearest to an even rate."""
+    """Lets the first frame of each interval pass: all cameras of a rig leave out the same moments."""
 
-    def __init__(self, source_fps: float) -> None:
-        self._source_fps = source_fps
-        self._half_source_ns = 0.5e9 / source_fps
-        self._due_ns: float | None = None
+    def __init__(self) -> None:
+        self._interval: int | None = None
 
-    def accepts(self, timestamp_ns: int, max_fps: float) -> bool:
-        """True for a frame that is due at a rate of at most `max_fps`."""
-        if max_fps >= self._source_fps:
-            return True
-        interval_ns = 1e9 / max_fps
-        if self._due_ns is None or abs(timestamp_ns - self._due_ns) > interval_ns:
-            self._due_ns = timestamp_ns
-        if timestamp_ns < self._due_ns - self._half_source_ns:
+    def accepts(self, rig_time_ns: int, max_fps: float) -> bool:
+        """True for the first frame exposed in an interval of 1/`max_fps` of rig time."""
+        interval = int(rig_time_ns * max_fps // 1_000_000_000)
+        if interval == self._interval:
             return False
-        self._due_ns += interval_ns
+        self._interval = interval
         return True

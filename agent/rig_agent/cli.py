@@ -131,8 +131,10 @@ def main() -> None:
 def _stream(settings: "AgentSettings") -> None:
     from rig_agent.agent import Agent
     from rig_agent.sources import open_source
+    from rig_protocol.codecs import keep_freed_memory
     from rig_protocol.key_file import rig_key
 
+    keep_freed_memory()
     agent = Agent(settings, rig_key(settings.key_file, settings.insecure), lambda: open_source(settings))
 
     def stop(*_: object) -> None:

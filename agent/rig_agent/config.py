@@ -54,7 +54,7 @@ class AgentSettings(Settings):
     fps: float | None = Field(None, ge=0.1, le=120, examples=[30.0])
     """Frames a second to send; unset: as many as the source delivers (a folder: 30)."""
     color: Manner = "lossless"
-    """How colour travels: losslessly compressed, as JPEG, or uncompressed. The server may refuse JPEG."""
+    """How colour travels while the link has room: losslessly compressed, as JPEG, or uncompressed."""
     depth: Literal["lossless", "raw"] = "lossless"
     """How depth travels: losslessly compressed or uncompressed."""
     datagram_size: int = Field(DEFAULT_DATAGRAM_SIZE, ge=MIN_DATAGRAM_SIZE, le=MAX_DATAGRAM_SIZE)

@@ -2,17 +2,19 @@
 
 from importlib.metadata import version
 
+from rig_agent.cipher_choice import ciphers_by_speed
 from rig_agent.config import AgentSettings, Manner
 from rig_agent.sources.base import SourceDescription
 from rig_protocol.codecs import Codec, ImageKind, codec, codecs_for
 from rig_protocol.codecs.raw import UncompressedCodec
 from rig_protocol.messages import Hello
 
-# The manners that an agent offers, best first. Nothing is sent lossy that the operator wanted lossless.
+# The manners that an agent offers, best first. JPEG comes last unless it is wanted: a server asks for it
+# only when the link carries nothing better, and never when its [link] jpeg = false.
 _OFFERS: dict[Manner, tuple[Manner, ...]] = {
-    "lossless": ("lossless", "raw"),
+    "lossless": ("lossless", "raw", "jpeg"),
     "jpeg": ("jpeg", "lossless", "raw"),
-    "raw": ("raw", "lossless"),
+    "raw": ("raw", "lossless", "jpeg"),
 }
 
 
@@ -29,6 +31,7 @@ def make_hello(settings: AgentSettings, source: SourceDescription) -> Hello:
         depth_codecs=_offer(source.depth_image, settings.depth),
         fps=min(source.fps, settings.fps or source.fps),
         software=f"kinect-rig {version('kinect-rig')}",
+        ciphers=ciphers_by_speed(),
     )
 
 

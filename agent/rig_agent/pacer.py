@@ -20,10 +20,14 @@ _MAX_RESENDS = 512
 
 @dataclass(frozen=True, slots=True)
 class BurstGrid:
-    """Moments at which bursts leave: agent times that are `phase_ns` modulo `step_ns`."""
+    """Moments at which bursts leave: agent times that are `phase_ns` modulo `step_ns`; see SPEC, PLAN.
+
+    `spread`: share of the frame interval to send a frame over.
+    """
 
     step_ns: int
     phase_ns: int
+    spread: float
 
     def next_ns(self, now_ns: int) -> int:
         """The first moment from `now_ns` on."""
@@ -53,6 +57,7 @@ class Pacer:
         self._position = 0
         self._started_ns = 0
         self._step_ns = 0
+        self._steps = 1
         self._due_ns = 0
         self._resends: deque[DatagramBatch] = deque(maxlen=_MAX_RESENDS)
         self._resend_due_ns = 0
@@ -64,8 +69,9 @@ class Pacer:
             return []
         given_up = [] if self._waiting is None else [self._waiting]
         self._waiting = batch
-        stale = now_ns - self._started_ns > _STALE_INTERVALS * self.interval_ns
-        if self._position == 0 or stale:
+        age_ns = now_ns - self._started_ns
+        fresh = -self.interval_ns <= age_ns <= _STALE_INTERVALS * self.interval_ns  # else the clock jumped
+        if self._position == 0 or not fresh:
             given_up.append(self._current)
             self._advance(now_ns)
         self.counters.dropped += len(given_up)
@@ -81,8 +87,8 @@ class Pacer:
         """The datagrams that are due, or None; tell `sent` how many of them went out."""
         if self._current is None or now_ns < self._due_ns:
             return None
-        bursts_due = 1 + (now_ns - self._started_ns) // self._step_ns
-        stop = min(bursts_due * self._burst, self._position + _CATCH_UP * self._burst)
+        due = self._due_after(1 + (now_ns - self._started_ns) // self._step_ns)
+        stop = min(max(due, self._position + 1), self._position + _CATCH_UP * self._burst)
         return DatagramBatch(self._current.part(self._position, stop), self._current.segment_size)
 
     def sent(self, count: int, now_ns: int) -> None:
@@ -94,7 +100,8 @@ class Pacer:
             self.counters.sent += 1
             self._advance(now_ns)
             return
-        planned_ns = self._started_ns + self._position // self._burst * self._step_ns
+        step = self._position * self._steps // len(self._current)  # the first at which more is due
+        planned_ns = self._started_ns + step * self._step_ns
         self._due_ns = max(planned_ns, now_ns + self._step_ns // 2)
 
     def resend(self, batch: DatagramBatch) -> None:
@@ -103,7 +110,7 @@ class Pacer:
 
     def next_resend(self, now_ns: int) -> DatagramBatch | None:
         """Datagrams to send again now, at most one burst a step, or None."""
-        if not self._resends or now_ns < self._resend_due_ns:
+        if not self._resends or 0 < self._resend_due_ns - now_ns <= self.interval_ns:
             return None
         batch = self._resends.popleft()
         if len(batch) > self._burst:
@@ -126,6 +133,10 @@ class Pacer:
         self._current = self._waiting = None
         self._resends.clear()
 
+    def _due_after(self, steps: int) -> int:
+        """How many datagrams of the frame are to have left after so many steps."""
+        return 0 if self._current is None else -(-steps * len(self._current) // self._steps)
+
     def _advance(self, now_ns: int) -> None:
         following, self._waiting, self._current = self._waiting, None, None
         if following is not None:
@@ -134,11 +145,11 @@ class Pacer:
     def _start(self, batch: DatagramBatch, now_ns: int) -> None:
         self._current, self._position = batch, 0
         if self.grid is not None and self._spread > 0:
-            steps = max(1, int(self.interval_ns * self._spread / self.grid.step_ns))
-            self._step_ns, self._burst = self.grid.step_ns, -(-len(batch) // steps)
+            self._steps = max(1, int(self.interval_ns * self.grid.spread / self.grid.step_ns))
+            self._step_ns = self.grid.step_ns
             self._started_ns = self._due_ns = self.grid.next_ns(now_ns)
-            return
-        self._burst = self._default_burst
-        bursts = max(1, -(-len(batch) // self._burst))
-        self._started_ns = self._due_ns = now_ns
-        self._step_ns = max(1, round(self.interval_ns * self._spread / bursts))
+        else:
+            self._steps = max(1, -(-len(batch) // self._default_burst))
+            self._step_ns = max(1, round(self.interval_ns * self._spread / self._steps))
+            self._started_ns = self._due_ns = now_ns
+        self._burst = -(-len(batch) // self._steps)

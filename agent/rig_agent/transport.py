@@ -1,5 +1,6 @@
 """The agent's only socket and clock: a connected UDP socket that outlives every network trouble."""
 
+import contextlib
 import errno
 import logging
 import socket
@@ -15,6 +16,7 @@ _log = logging.getLogger(__name__)
 # linux/udp.h: the kernel, or the network card, cuts one large send into datagrams of a given size.
 _SOL_UDP = 17
 _UDP_SEGMENT = 103
+_SO_MAX_PACING_RATE = 47  # <asm-generic/socket.h>; bytes a second
 _MAX_SEGMENTS = 44  # 44 × 1472 B is the most that one 64-KiB IP packet carries; 45 are refused
 _MAX_SEND_BYTES = 65_507
 
@@ -49,6 +51,7 @@ class Transport:
         self._server = server
         self._socket: socket.socket | None = None
         self._segmentation = True
+        self._rate = 0
         self._last_error: str | None = None
         self.counters = TransportCounters()
 
@@ -59,11 +62,24 @@ class Transport:
             family, address = _resolve(self._server)
             self._socket = socket.socket(family, socket.SOCK_DGRAM | socket.SOCK_NONBLOCK)
             self._socket.connect(address)
+            if self._rate:
+                self.limit_rate(self._rate)
         except OSError as error:
             self._note(error)
             self.close()
             return False
         return True
+
+    def limit_rate(self, bytes_per_s: float) -> None:
+        """Let the kernel space the datagrams of a burst (SO_MAX_PACING_RATE).
+
+        Works where the interface has the `fq` discipline; elsewhere Linux takes the option and ignores it,
+        and our own pacing is all there is.
+        """
+        self._rate = int(bytes_per_s)
+        if self._socket is not None:
+            with contextlib.suppress(OSError):  # a kernel without it
+                self._socket.setsockopt(socket.SOL_SOCKET, _SO_MAX_PACING_RATE, self._rate)
 
     def fileno(self) -> int | None:
         """For a selector; None while not open."""

@@ -21,16 +21,22 @@ _log = logging.getLogger(__name__)
 _REOPEN_NS = 5_000_000_000
 _NO_NETWORK_RETRY_NS = 1_000_000_000
 _ONE_FRAME_NS = 33_333_333
+# Within a burst the kernel may send so much quicker than on average: bursts end well before the next one.
+_BURST_HASTE = 4.0
 
 
 @dataclass(frozen=True, slots=True)
 class Wanted:
-    """What the server wants of this camera: codecs (None: not this stream), at most `fps` frames a second."""
+    """What the server wants of this camera: codecs (None: not this stream), at most `fps` frames a second.
+
+    Rig time is agent time and `rig_offset_ns`.
+    """
 
     camera_id: int
     color_codec: int | None
     depth_codec: int | None
-    fps: float | None
+    fps: float | None = None
+    rig_offset_ns: int = 0
 
 
 class Uplink:
@@ -54,6 +60,7 @@ class Uplink:
         self._full_interval_ns = _ONE_FRAME_NS
         self._reopen_ns = 0
         self._refusal = ""
+        self._rate = 1.0  # bytes a second that the kernel may send
         self._resent_before = 0  # by the links of cameras that were introduced before
         self.connections = 0
         self.unheard = 0
@@ -72,8 +79,8 @@ class Uplink:
         plan = self._link.plan
         if plan is None:
             color, depth = _first(welcome.color_codecs), _first(welcome.depth_codecs)
-            return Wanted(welcome.camera_id, color, depth, None)
-        return Wanted(welcome.camera_id, plan.color_codec, plan.depth_codec, plan.fps)
+            return Wanted(welcome.camera_id, color, depth)
+        return Wanted(welcome.camera_id, plan.color_codec, plan.depth_codec, plan.fps, plan.offset_ns)
 
     @property
     def sent(self) -> int:
@@ -118,6 +125,7 @@ class Uplink:
             return
         for given_up in self._pacer.submit(batch, now_ns):
             self._link.give_up_frame(given_up)
+        self._limit_rate(batch.total_bytes)
 
     def serve(self, now_ns: int) -> None:
         """Receive what came, do what is due, send what is due."""
@@ -168,9 +176,16 @@ class Uplink:
         if plan is self._plan:
             return
         self._plan = plan
-        self._pacer.grid = None if plan is None else BurstGrid(plan.step_ns, plan.phase_ns)
+        self._pacer.grid = None if plan is None else _grid(plan)
         planned_ns = 0 if plan is None else round(1e9 / plan.fps)
         self._pacer.interval_ns = max(self._full_interval_ns, planned_ns)
+
+    def _limit_rate(self, frame_bytes: int) -> None:
+        """Tell the kernel when the frames' rate has changed by a quarter."""
+        rate = _BURST_HASTE * frame_bytes * 1e9 / self._pacer.interval_ns
+        if not 0.8 < rate / self._rate < 1.25:
+            self._rate = rate
+            self._transport.limit_rate(rate)
 
     def _say_goodbye(self, now_ns: int) -> None:
         self._pacer.clear()
@@ -197,6 +212,10 @@ class Uplink:
             case Disconnected(text):
                 self._pacer.clear()
                 _log.warning("lost %s: %s; trying on", self._server, text)
+
+
+def _grid(plan: StreamPlan) -> BurstGrid:
+    return BurstGrid(plan.step_ns, (plan.phase_ns - plan.offset_ns) % plan.step_ns, plan.spread)
 
 
 def _first(codecs: tuple[int, ...]) -> int | None:

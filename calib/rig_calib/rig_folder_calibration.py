@@ -50,6 +50,5 @@ def read_views(folder: Path, description: RigDescription, frames: int | None = N
             for camera in description.cameras
             if index in held[camera.id]
         }
-        timestamps = [frame.timestamp_ns for frame in found.values() if frame is not None]
-        panoramas.append(PanoramicFrame(index, timestamps[0], found, max(timestamps) - min(timestamps)))
+        panoramas.append(PanoramicFrame.of(index, found))
     return views_from_panoramas(description, panoramas)

@@ -50,8 +50,9 @@ FRAGMENT_HEADER = np.dtype(
 # which fills the top 16 bits of the last word.
 _WORDS = FRAGMENT_HEADER_SIZE // 8
 _NEXT_FRAGMENT = np.array([0, 0, 0, 1 << 48], dtype="<u8")
-# Taking a few datagrams one by one costs less than comparing their headers.
-_WORTH_COMPARING = 4
+# NumPy's fixed cost pays from about so many headers on.
+_WORTH_COMPARING = 16
+_INDEX_AT = FRAGMENT_HEADER_SIZE - 2
 
 
 class MessageType(IntEnum):
@@ -170,16 +171,36 @@ def write_fragment_headers(first: FragmentHeader, rows: npt.NDArray[np.uint8]) -
 def consecutive_runs(batch: DatagramBatch) -> Iterator[tuple[int, memoryview]]:
     """The batch cut into runs (count, bytes) of equal-sized datagrams whose headers continue the first one's.
 
-    Anything that is no fragment, the shorter last datagram, and each of a few datagrams is a run of its own.
+    Anything that is no fragment, and the shorter last datagram, is a run of its own.
     """
     full = len(batch.buffer) // batch.segment_size
-    if full >= _WORTH_COMPARING and batch.segment_size > FRAGMENT_HEADER_SIZE:
-        strides = (batch.segment_size, 8)
-        words = np.ndarray((full, _WORDS), "<u8", batch.buffer, strides=strides)
-        follows = (words[1:] - words[:-1] == _NEXT_FRAGMENT).all(axis=1)
-        edges = [0, *(np.flatnonzero(~follows) + 1).tolist(), full]
-    else:
+    if batch.segment_size <= FRAGMENT_HEADER_SIZE:
         edges = list(range(full + 1))
+    elif full >= _WORTH_COMPARING:
+        edges = _edges_of_many(batch, full)
+    else:
+        edges = _edges_of_few(memoryview(batch.buffer), batch.segment_size, full)
     yield from ((stop - start, batch.part(start, stop)) for start, stop in pairwise(edges))
     if full < len(batch):
         yield 1, batch.part(full, full + 1)
+
+
+def _edges_of_many(batch: DatagramBatch, full: int) -> list[int]:
+    """Where runs begin, and `full`: by one comparison of all headers."""
+    words = np.ndarray((full, _WORDS), "<u8", batch.buffer, strides=(batch.segment_size, 8))
+    follows = (words[1:] - words[:-1] == _NEXT_FRAGMENT).all(axis=1)
+    return [0, *(np.flatnonzero(~follows) + 1).tolist(), full]
+
+
+def _edges_of_few(buffer: memoryview, size: int, full: int) -> list[int]:
+    """The same, header by header: what all of a frame share, and the index, which counts up."""
+    edges, shared, index = [0], b"", 0
+    for k in range(full):
+        start, index = k * size, index + 1
+        end = start + _INDEX_AT
+        here = buffer[end] | buffer[end + 1] << 8
+        if here != index or buffer[start:end].tobytes() != shared:
+            shared, index = buffer[start:end].tobytes(), here
+            if k:
+                edges.append(k)
+    return [*edges, full] if full else [0]

@@ -4,9 +4,9 @@ Three clocks are kept apart by name: `device_ticks` (60 MHz in the Kinect), `age
 (the Pi's monotonic clock) and `timestamp_ns` (the rig clock, which is the server's monotonic clock).
 """
 
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, Self
 
 import numpy as np
 import numpy.typing as npt
@@ -28,7 +28,8 @@ NO_DEPTH_MM = 0
 class RgbdFrame:
     """One camera's colour and depth of one instant.
 
-    Colour is either `bayer` (H,W) u8, GRBG, or `color` (H,W,3) BGR or (H,W) grey u8.
+    Colour is either `bayer` (H,W) u8, GRBG, or `color` (H,W,3) BGR or (H,W) grey u8; a server that was
+    asked to demosaic gives both.
     Depth is either `raw` (H,W) u16 11-bit disparity, 2047 = none, or `depth_mm` (H,W) u16, 0 = none.
     `received_ns`: rig time at which its last datagram was here; None where it crossed no network.
     """
@@ -78,12 +79,30 @@ class PanoramicFrame:
     """One synchronised set: a frame, or None where it is missing, for every expected camera.
 
     `timestamp_ns` is the mean exposure time; `spread_ns` is the latest minus the earliest.
+    `uncertainty_ns` is the largest standard uncertainty among its frames' times: two exposures of the set
+    are known against each other, and so is the spread, to √2 of it or better.
     """
 
     index: int
     timestamp_ns: int
     frames: Mapping[int, RgbdFrame | None]
     spread_ns: int
+    uncertainty_ns: int = 0
+
+    @classmethod
+    def of(cls, index: int, frames: Mapping[int, RgbdFrame | None]) -> Self:
+        """The set of these frames, its times computed; ValueError when it holds none."""
+        present = [frame for frame in frames.values() if frame is not None]
+        if not present:
+            raise ValueError(f"set {index} holds no frame")
+        times_ns = [frame.timestamp_ns for frame in present]
+        return cls(
+            index=index,
+            timestamp_ns=mean_time_ns(present),
+            frames=frames,
+            spread_ns=max(times_ns) - min(times_ns),
+            uncertainty_ns=max(frame.uncertainty_ns for frame in present),
+        )
 
     @property
     def missing(self) -> tuple[int, ...]:
@@ -94,3 +113,8 @@ class PanoramicFrame:
     def complete(self) -> bool:
         """True when every expected camera delivered."""
         return not self.missing
+
+
+def mean_time_ns(frames: Collection[RgbdFrame]) -> int:
+    """Mean exposure time of at least one frame, rounded down."""
+    return sum(frame.timestamp_ns for frame in frames) // len(frames)

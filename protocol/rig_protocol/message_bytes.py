@@ -57,6 +57,7 @@ MAX_GAUGE_NAME_BYTES = 32
 MIN_FPS, MAX_FPS = 0.1, 240.0
 # 4 bytes each; a frame with more gaps is asked for in several messages.
 MAX_RANGES = 250
+MIN_SPREAD = 0.05
 _MAX_STEP_NS = 1_000_000_000
 
 _REJECT = struct.Struct("<BBBx")
@@ -301,6 +302,8 @@ def _plan_of(values: Fields) -> StreamPlan:
         fps=number(values, "fps", MIN_FPS, MAX_FPS),
         step_ns=step_ns,
         phase_ns=integer(values, "phase_ns", 0, step_ns - 1),
+        spread=number(values, "spread", MIN_SPREAD, 1.0),
+        offset_ns=integer(values, "offset_ns", -(2**63), 2**63 - 1),
     )
 
 

@@ -78,23 +78,32 @@ class Reject:
 class StreamChoice:
     """What the server wants of one agent: a plan that does not know the agent's clock yet.
 
-    Of each `step_ns` of rig time the agents take turns: this one is `slot` of `slots`.
+    Of each `step_ns` of rig time the agents take turns: this one is `slot` of `slots`. A frame is sent over
+    the share `spread` of its interval.
     """
 
     color_codec: int | None
     depth_codec: int | None
     fps: float
-    step_ns: int
     slot: int
     slots: int
+    step_ns: int
+    spread: float
+
+    @property
+    def phase_ns(self) -> int:
+        """When its bursts begin, in rig time modulo `step_ns`."""
+        return self.slot * self.step_ns // self.slots
 
 
 @dataclass(frozen=True, slots=True)
 class StreamPlan:
     """What an agent is to send from now on, and when: the server's share of the link for one camera.
 
-    At most `fps` frames a second. Bursts of datagrams leave at agent times that are `phase_ns` modulo
-    `step_ns`, so that those of different agents meet the switch one after another.
+    At most `fps` frames a second, one in each of the rig clock's intervals, and each sent over the share
+    `spread` of its interval. Bursts of datagrams leave at rig times that are `phase_ns` modulo `step_ns`,
+    so that those of different agents meet the switch one after another. Rig time is agent time and
+    `offset_ns`.
     """
 
     color_codec: int | None
@@ -102,6 +111,8 @@ class StreamPlan:
     fps: float
     step_ns: int
     phase_ns: int
+    spread: float
+    offset_ns: int
 
 
 @dataclass(frozen=True, slots=True)

@@ -4,6 +4,8 @@ Fragments leave the agent in ascending order. So one is missed as soon as a late
 when nothing has come for longer than the agent's pace explains, or when the next frame has begun.
 """
 
+from collections.abc import Callable
+
 import numpy as np
 import numpy.typing as npt
 
@@ -53,14 +55,21 @@ class OpenUnit:
         """All that has not come is missed: ask for it from `ask_ns` on."""
         self._miss(self.total, ask_ns)
 
-    def ask(self, now_ns: int, tail_ns: int, answers: SmoothedDelay) -> list[tuple[int, int]]:
-        """What to ask for now, as (first, count); `tail_ns` without a fragment is a missed tail."""
+    def ask(
+        self, now_ns: int, tail_ns: int, answers: SmoothedDelay, afford: Callable[[int], int]
+    ) -> list[tuple[int, int]]:
+        """What to ask for now, as (first, count); `tail_ns` without a fragment is a missed tail.
+
+        `afford` grants so many of a number of fragments; the others are asked for later.
+        """
         if self.edge < self.total and now_ns - self.last_ns >= tail_ns:
             self.miss_tail(now_ns)
         wanted = np.zeros(0, np.int64)
         if self._ask_ns is not None:
             lacking = np.flatnonzero(np.frombuffer(self.received, np.uint8)[: self.edge] == 0)
-            wanted = lacking[self._ask_ns[lacking] <= now_ns]
+            due = lacking[self._ask_ns[lacking] <= now_ns]
+            wanted, refused = np.split(due, [afford(due.size) if due.size else 0])
+            self._ask_ns[refused] = now_ns + answers.bound_ns
             self._asked_ns[wanted] = now_ns
             self._tries[wanted] += 1
             self._ask_ns[wanted] = now_ns + _waits_ns(self._tries[wanted], answers.bound_ns)

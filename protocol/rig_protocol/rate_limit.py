@@ -19,6 +19,8 @@ class RateLimit:
     def allows(self, key: Hashable, now_ns: int) -> bool:
         """True, and remembered, when an event of this key may happen now."""
         full_ns = max(self._full_ns.get(key, now_ns), now_ns)
+        if full_ns - now_ns > self._saved_ns + self._interval_ns:
+            full_ns = now_ns  # the clock was set back
         if full_ns - now_ns > self._saved_ns:
             return False
         self._full_ns[key] = full_ns + self._interval_ns

@@ -3,6 +3,7 @@
 Rules and numbers: protocol/SPEC.md, section 7.
 """
 
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -21,6 +22,7 @@ from rig_protocol.frames import EncodedFrame
 from rig_protocol.message_bytes import MAX_RANGES
 from rig_protocol.messages import WHOLE_FRAME, Resend
 from rig_protocol.open_unit import MAX_TRIES, REORDER_NS, OpenUnit
+from rig_protocol.resend_budget import ResendBudget
 from rig_protocol.security import FrameSeal
 from rig_protocol.smoothed_delay import SmoothedDelay
 
@@ -39,6 +41,8 @@ _MAX_FRAGMENTS = 2**16
 # Buffers of units that are done, for those to come: a camera has one or two open at a time.
 _MAX_SPARE = 2
 _NEVER_NS = 2**63 - 1
+# NumPy's fixed cost pays from about so many payloads on.
+_FEW = 10
 
 
 class _UnitKey(NamedTuple):
@@ -65,11 +69,21 @@ class Reassembler:
     `due_ns` is never later than the moment at which `handle_timeout` has something to do.
     """
 
-    def __init__(self, camera_id: int, fps: float, counters: CameraCounters, seal: FrameSeal) -> None:
+    def __init__(
+        self,
+        camera_id: int,
+        fps: float,
+        counters: CameraCounters,
+        seal: FrameSeal,
+        budget: ResendBudget | None = None,
+    ) -> None:
+        """`budget`: what all cameras may ask for again; None: as much as they like."""
         self._camera_id = camera_id
         self._interval_ns = round(1e9 / fps)
         self._counters = counters
         self._seal = seal
+        self._budget = budget or ResendBudget()
+        self._frame_bytes = 1  # of the latest frame
         self._open: dict[_UnitKey, OpenUnit] = {}  # oldest first
         self._spare: list[bytearray] = []
         self._lost_keys: dict[_UnitKey, None] = {}  # oldest first
@@ -146,7 +160,9 @@ class Reassembler:
     def _ask_for_units(self, now_ns: int) -> list[Resend]:
         requests = []
         for key, unit in self._open.items():
-            ranges = unit.ask(now_ns, self._pace.bound_ns, self._answers)
+            size = FRAGMENT_HEADER_SIZE + key.payload_size
+            afford = partial(self._budget.grant, piece_bytes=size, now_ns=now_ns)
+            ranges = unit.ask(now_ns, self._pace.bound_ns, self._answers, afford)
             self._counters.requested += sum(count for _, count in ranges)
             parts = (tuple(ranges[k : k + MAX_RANGES]) for k in range(0, len(ranges), MAX_RANGES))
             requests += [Resend(key.frame_number, part) for part in parts]
@@ -158,9 +174,10 @@ class Reassembler:
             if unseen.deadline_ns <= now_ns or unseen.tries == MAX_TRIES:
                 del self._unseen[number]  # it counts as missing when it leaves the window
             elif unseen.ask_ns <= now_ns:
-                unseen.tries += 1
-                unseen.ask_ns = now_ns + (self._answers.bound_ns << min(unseen.tries, 4))
-                requests.append(Resend(number, WHOLE_FRAME))
+                unseen.ask_ns = now_ns + (self._answers.bound_ns << min(unseen.tries + 1, 4))
+                if self._budget.grant(1, self._frame_bytes, now_ns):
+                    unseen.tries += 1
+                    requests.append(Resend(number, WHOLE_FRAME))
         return requests
 
     def _miss_before(self, number: int, now_ns: int) -> None:
@@ -215,6 +232,7 @@ class Reassembler:
             self._counters.evicted += 1
             self._give_up(next(iter(self._open)))
         deadline_ns = now_ns + self._interval_ns + GRACE_NS
+        self._frame_bytes = key.unit_size
         unit = OpenUnit(header, self._buffer(key.unit_size), deadline_ns, now_ns)
         unseen = self._unseen.pop(key.frame_number, None)
         unit.wholly_resent = unseen is not None and unseen.tries > 0
@@ -314,10 +332,13 @@ def _fits(first: FragmentHeader, count: int, size: int) -> bool:
 
 
 def _copy(run: Buffer, count: int, content: bytearray, offset: int, size: int) -> None:
-    """Payloads of a run into their place: one strided copy."""
-    if count == 1:
-        content[offset : offset + size] = memoryview(run)[FRAGMENT_HEADER_SIZE:]
+    """Payloads of a run into their place: one by one where they are few, else in one strided copy."""
+    if count <= _FEW:
+        place, source = memoryview(content), memoryview(run)
+        for start in range(FRAGMENT_HEADER_SIZE, len(run), FRAGMENT_HEADER_SIZE + size):
+            place[offset : offset + size] = source[start : start + size]
+            offset += size
         return
     rows = np.frombuffer(run, dtype=np.uint8).reshape(count, FRAGMENT_HEADER_SIZE + size)
-    place = np.frombuffer(content, dtype=np.uint8, count=count * size, offset=offset).reshape(count, size)
-    place[:] = rows[:, FRAGMENT_HEADER_SIZE:]
+    target = np.frombuffer(content, dtype=np.uint8, count=count * size, offset=offset)
+    target.reshape(count, size)[:] = rows[:, FRAGMENT_HEADER_SIZE:]

@@ -35,7 +35,7 @@ _NOTICE_INTERVAL_ALL_NS = 5_000_000
 # A key agreement costs 0.1 ms: so many a second are 1 % of a core.
 _HANDSHAKE_INTERVAL_NS = 10_000_000
 # Agents that lost their server in the same moment ask for it in step: all of them are to be answered at once.
-_HANDSHAKE_BURST = 32
+_HANDSHAKE_BURST = 64
 _REFUSAL_EVENT_INTERVAL_NS = 1_000_000_000
 
 

@@ -36,12 +36,16 @@ from rig_protocol.message_bytes import MAX_CONTROL_SIZE, decode_body
 from rig_protocol.messages import ClockReply, Goodbye, Heartbeat, StreamChoice
 from rig_protocol.pending_sessions import PendingSession
 from rig_protocol.reception import Reception, Terms
+from rig_protocol.resend_budget import ResendBudget
 from rig_protocol.rig_key import RigKey
 from rig_protocol.roster import Roster
 from rig_protocol.security import RandomBytes
 from rig_protocol.server_session import CameraStatus, ServerSession
 from rig_protocol.session_table import SessionTable
+from rig_protocol.system_clock import SystemClockReading
 
+# A rig clock that reads so much less than before has been set back: no time of a session means anything.
+_BACKWARD_STEP_NS = 1_000_000_000
 # Answers wait for one turn of the shell; a flood of hellos beyond this loses its oldest answers.
 _MAX_OUTGOING = 1024
 _ASSIGNED = frozenset(MessageType)
@@ -66,8 +70,14 @@ class ServerLink:
                 f"datagram size {datagram_size} is not in {MIN_DATAGRAM_SIZE}..{MAX_DATAGRAM_SIZE}"
             )
         self.rejected: Counter[str] = Counter()
-        self._sessions = SessionTable()
+        self.authenticated = not rig_key.is_public
+        """True where only who holds a secret key may join."""
+        self.system_clock: SystemClockReading | None = None
+        """What the server machine's system clock is worth, set by the shell every second or so."""
+        self._resend_budget = ResendBudget()
+        self._sessions = SessionTable(self._resend_budget)
         self._clock_due: list[ServerSession] = []
+        self._latest_ns = 0
         self._due_ns: int | None = None  # never later than what is due; None: nobody is connected
         self._events = EventQueue()
         self._outgoing: deque[tuple[bytes, Address]] = deque(maxlen=_MAX_OUTGOING)
@@ -89,6 +99,7 @@ class ServerLink:
 
     def receive_batch(self, batch: DatagramBatch, address: Address, now_ns: int) -> None:
         """Take datagrams of one sender; the buffer may be reused after the call."""
+        self._check_clock(now_ns)
         if 0 < len(batch.buffer) <= batch.segment_size:
             self._receive(batch.buffer, address, now_ns)
             return
@@ -101,6 +112,7 @@ class ServerLink:
 
     def receive_datagram(self, data: Buffer, address: Address, now_ns: int) -> None:
         """Take one datagram."""
+        self._check_clock(now_ns)
         self._receive(data, address, now_ns)
 
     def datagrams_to_send(self, now_ns: int) -> list[tuple[bytes, Address]]:
@@ -130,6 +142,10 @@ class ServerLink:
                 self._clock_due.append(session)
         self._due_ns = min((session.due_ns for session in self._sessions), default=None)
 
+    def limit_resends(self, bytes_per_s: float | None) -> None:
+        """What the link has left for resends of all cameras; None: no limit."""
+        self._resend_budget.limit(bytes_per_s)
+
     def plan_stream(self, camera_id: int, choice: StreamChoice) -> None:
         """What a connected camera is to send from now on; told with its next clock request.
 
@@ -146,9 +162,14 @@ class ServerLink:
     def close(self, now_ns: int) -> None:  # noqa: ARG002  # the verbs of both links take the time
         """End every session with a goodbye, to be fetched with `datagrams_to_send`; welcome nobody after."""
         self._reception.close()
-        for session in self._sessions:
-            self._send(session.seal(Goodbye("the server stops")), session.address)
-            self._end(session, "the server stops")
+        self._end_all("the server stops")
+
+    def _check_clock(self, now_ns: int) -> None:
+        """Begin anew when the rig clock was set back: the agents come again within a second."""
+        if now_ns < self._latest_ns - _BACKWARD_STEP_NS:
+            self._end_all("the rig clock was set back")
+            self._due_ns = None
+        self._latest_ns = now_ns
 
     # ---- dispatch
 
@@ -211,7 +232,7 @@ class ServerLink:
             case Heartbeat():
                 session.receive_heartbeat(message, now_ns)
             case ClockReply():
-                session.receive_clock_reply(message, now_ns)
+                session.receive_clock_reply(message, self.system_clock, now_ns)
             case Goodbye(text):
                 self._end(session, f"goodbye: {text}")
 
@@ -250,6 +271,11 @@ class ServerLink:
     def _end(self, session: ServerSession, text: str) -> None:
         self._sessions.end(session)
         self._push(CameraLeft(session.welcome.camera_id, text))
+
+    def _end_all(self, text: str) -> None:
+        for session in self._sessions:
+            self._send(session.seal(Goodbye(text)), session.address)
+            self._end(session, text)
 
     # ---- out
 

@@ -14,8 +14,10 @@ from rig_protocol.handshake import Agreement
 from rig_protocol.message_bytes import encode_body
 from rig_protocol.messages import ClockReply, Heartbeat, Hello, Message, StreamChoice, StreamPlan
 from rig_protocol.reassembler import Reassembler
+from rig_protocol.resend_budget import ResendBudget
 from rig_protocol.sealed_channel import SealedChannel
 from rig_protocol.security import FrameSeal
+from rig_protocol.system_clock import SystemClockReading
 
 SILENCE_NS = 2_000_000_000
 # A frame is in the past when it arrives; clocks and their reading err by so much beyond the uncertainty.
@@ -51,7 +53,9 @@ class ServerSession:
     `due_ns` is never later than the moment at which `handle_timeout` has something to do.
     """
 
-    def __init__(self, status: CameraStatus, agreement: Agreement, now_ns: int) -> None:
+    def __init__(
+        self, status: CameraStatus, agreement: Agreement, resend_budget: ResendBudget, now_ns: int
+    ) -> None:
         welcome, keys = agreement.welcome, agreement.keys
         self.status = status
         self.address = status.address  # a session is bound to it; the status may move on
@@ -63,7 +67,11 @@ class ServerSession:
         )
         self._clock = ClockSync(now_ns)
         self._reassembler = Reassembler(
-            welcome.camera_id, status.hello.fps, status.counters, FrameSeal(welcome.cipher, keys)
+            welcome.camera_id,
+            status.hello.fps,
+            status.counters,
+            FrameSeal(welcome.cipher, keys),
+            resend_budget,
         )
         self.due_ns = now_ns
 
@@ -101,13 +109,19 @@ class ServerSession:
         """The datagram of a message to this agent."""
         return self._channel.seal(*encode_body(message))
 
-    def receive_clock_reply(self, reply: ClockReply, now_ns: int) -> None:
-        """Take a clock reply into the estimate."""
-        counters = self.status.counters
-        steps_before = self._clock.steps
-        if not self._clock.receive(reply, now_ns):
+    def receive_clock_reply(
+        self, reply: ClockReply, rig_system_clock: SystemClockReading | None, now_ns: int
+    ) -> None:
+        """Take a clock reply into the estimate, and what both machines say of their system clocks."""
+        counters, clock = self.status.counters, self._clock
+        before = clock.steps, clock.system_clock_disagreements
+        if clock.receive(reply, now_ns):
+            told = SystemClockReading(reply.wall_minus_agent_ns, reply.wall_error_ns)
+            clock.use_system_clocks(told, rig_system_clock, now_ns)
+        else:
             counters.bad_clock_reply += 1
-        counters.clock_steps += self._clock.steps - steps_before
+        counters.clock_steps += clock.steps - before[0]
+        counters.system_clock_disagreements += clock.system_clock_disagreements - before[1]
         self.status.clock = self._clock.estimate
         self.due_ns = min(self.due_ns, self._clock.next_request_ns)
 
@@ -173,12 +187,13 @@ class ServerSession:
 
 
 def _plan(choice: StreamChoice, offset_ns: int) -> StreamPlan:
-    """A choice in the clock of an agent whose time plus `offset_ns` is rig time."""
-    slot_ns = choice.step_ns * choice.slot // choice.slots
+    """A choice for an agent whose time plus `offset_ns` is rig time."""
     return StreamPlan(
         color_codec=choice.color_codec,
         depth_codec=choice.depth_codec,
         fps=choice.fps,
         step_ns=choice.step_ns,
-        phase_ns=(slot_ns - offset_ns) % choice.step_ns,
+        phase_ns=choice.phase_ns,
+        spread=choice.spread,
+        offset_ns=offset_ns,
     )

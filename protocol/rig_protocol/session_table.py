@@ -7,13 +7,16 @@ from rig_protocol.admission import same_agent
 from rig_protocol.events import Address
 from rig_protocol.messages import Hello
 from rig_protocol.pending_sessions import PendingSession
+from rig_protocol.resend_budget import ResendBudget
 from rig_protocol.server_session import CameraStatus, ServerSession
 
 
 class SessionTable:
     """At most one session a camera; statuses outlive sessions. The roster bounds the cameras."""
 
-    def __init__(self) -> None:
+    def __init__(self, resend_budget: ResendBudget) -> None:
+        """All sessions share the budget."""
+        self._resend_budget = resend_budget
         self._sessions: dict[int, ServerSession] = {}  # by session id
         self._statuses: dict[int, CameraStatus] = {}  # by camera id
 
@@ -55,7 +58,9 @@ class SessionTable:
             status = CameraStatus(welcome.camera_id, hello.name, address, hello)
             self._statuses[welcome.camera_id] = status
         status.joined(hello, address)
-        self._sessions[welcome.session_id] = ServerSession(status, pending.agreement, now_ns)
+        self._sessions[welcome.session_id] = ServerSession(
+            status, pending.agreement, self._resend_budget, now_ns
+        )
 
     def end(self, session: ServerSession) -> None:
         """Close a session; what it leaves unfinished is counted."""

@@ -33,6 +33,8 @@ class Faults:
     delay_ns: int = 100_000
     jitter_ns: int = 0  # mean of an exponential delay on top
     corrupt: float = 0.0  # bits flipped, or the end cut off
+    outage_ns: int = 0  # nothing passes for so long ...
+    outage_interval_ns: int = 1_000_000_000  # ... once in so much time on average
 
 
 class LossyLink:
@@ -43,13 +45,14 @@ class LossyLink:
         self.done: Counter[str] = Counter()
         self._random = random.Random(seed)
         self._burst_left = 0
+        self._outage_ns = self._next_outage_ns(0)
         self._under_way: list[tuple[int, int, bytes]] = []
         self._sent = 0
 
     def send(self, datagram: bytes, now_ns: int) -> None:
         """Put a datagram on the link."""
         self.done["sent"] += 1
-        if self._is_lost():
+        if self._is_out(now_ns) or self._is_lost():
             self.done["lost"] += 1
             return
         copies = 2 if self._happens("duplicate", self.faults.duplicate) else 1
@@ -65,6 +68,16 @@ class LossyLink:
     def next_arrival_ns(self) -> int | None:
         """When the next datagram arrives; None while none is under way."""
         return self._under_way[0][0] if self._under_way else None
+
+    def _is_out(self, now_ns: int) -> bool:
+        if not self.faults.outage_ns:
+            return False
+        if now_ns >= self._outage_ns + self.faults.outage_ns:
+            self._outage_ns = self._next_outage_ns(now_ns)
+        return now_ns >= self._outage_ns
+
+    def _next_outage_ns(self, now_ns: int) -> int:
+        return now_ns + round(self._random.expovariate(1 / self.faults.outage_interval_ns))
 
     def _is_lost(self) -> bool:
         if self._burst_left == 0 and self._random.random() < self.faults.burst:

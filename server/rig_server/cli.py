@@ -1,5 +1,8 @@
 """The command line of `rig-server`."""
 
+import contextlib
+import json
+from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -7,11 +10,13 @@ import typer
 from rich.console import Console
 
 from rig_protocol.errors import ConfigurationError
-from rig_protocol.programs import run_program, set_up_logging
+from rig_protocol.programs import EXIT_FAILED, run_program, set_up_logging
 
 if TYPE_CHECKING:
     from rig_server.config import RigSettings
     from rig_server.rig import Rig
+
+_RING = 12  # cameras where no settings say how many
 
 _EXAMPLES = """
 **Examples**
@@ -20,9 +25,13 @@ _EXAMPLES = """
 
 `rig-server` — receive on UDP port 4012 and show the live table until Ctrl-C
 
+`rig-server --metrics 9100` — the same, and metrics for a Prometheus on this machine
+
 `rig-server --calibrate --out calibration` — calibrate the ring that streams to this PC
 
 `rig-server --calibrate --simulate 12 --out demo` — the same with twelve simulated Kinects on this machine
+
+`rig-server budget` — what the network must carry, what fits, and what the server would choose
 
 Every option can also stand in rig.toml or in the environment (RIG_SERVER_LISTEN, ...).
 The command line wins over the environment, the environment over the file.
@@ -47,6 +56,10 @@ def run(
     ] = None,
     listen: Annotated[
         str | None, typer.Option(metavar="HOST:PORT", help="Receive here; else 0.0.0.0:4012.")
+    ] = None,
+    metrics: Annotated[
+        str | None,
+        typer.Option(metavar="[HOST:]PORT", help="Serve metrics to Prometheus; to this machine unless HOST."),
     ] = None,
     calibrate: Annotated[
         bool, typer.Option("--calibrate", help="Calibrate the ring on the first complete sets, then end.")
@@ -87,6 +100,7 @@ def run(
     changes = {
         "listen": listen,
         "insecure": insecure or None,
+        "metrics": metrics,
         "capture": {"frames": frames},
         "calibration": {"method": method},
     }
@@ -99,11 +113,13 @@ def run(
         from rig_server.calibrating import calibrate_rig
 
         make_output_folder(folder := out or Path("calibration"))
-        calibrate_rig(_open_rig(settings, simulate, seed), folder, console)
+        with _open_rig(settings, simulate, seed) as rig:
+            calibrate_rig(rig, folder, console)
     else:
         from rig_server.receiving import receive
 
-        receive(_open_rig(settings, simulate, seed), console)
+        with _open_rig(settings, simulate, seed) as rig:
+            receive(rig, console)
 
 
 @app.command()
@@ -142,12 +158,67 @@ def keygen(
     )
 
 
-def _open_rig(settings: "RigSettings", simulate: int | None, seed: int | None) -> "Rig":
+_BUDGET_EXAMPLES = """
+**Examples**
+
+`rig-server budget` — the rig of rig.toml, or twelve cameras, at 30 frames/s
+
+`rig-server budget --cameras 12 --link-mbit 100` — what a 100-Mbit port would do to it
+
+`rig-server budget --fps 15 --json` — for a script
+
+A frame's size follows from the scene: the table goes by real frames, and says how many frames a second
+scenes of pure noise would allow. docs/network.md explains it, `[link]` of rig.toml sets it.
+Exit status: 0 something fits, 1 nothing does, 2 wrong usage or settings.
+"""
+
+
+@app.command(epilog=_BUDGET_EXAMPLES)
+def budget(
+    config: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FILE", help="Settings; else ./rig.toml, else /etc/kinect-rig/rig.toml, if there."
+        ),
+    ] = None,
+    cameras: Annotated[
+        int | None, typer.Option(metavar="N", min=1, max=64, help="Cameras; else those of rig.toml, else 12.")
+    ] = None,
+    fps: Annotated[
+        float, typer.Option(metavar="F", min=0.1, max=240, help="Frames a second of each camera.")
+    ] = 30.0,
+    link_mbit: Annotated[
+        float | None, typer.Option(metavar="M", help="Speed of this PC's port in Mbit/s; else 1000.")
+    ] = None,
+    mtu: Annotated[
+        int | None, typer.Option(metavar="BYTES", help="Largest IP packet of the network; else 1500.")
+    ] = None,
+    as_json: Annotated[bool, typer.Option("--json", help="Print JSON and nothing else.")] = False,
+) -> None:
+    """Print what the network must carry, what fits, and what the server would choose and why."""
+    from rig_server.budget_report import make_report, render
+    from rig_server.config import load_rig_settings
+
+    settings = load_rig_settings(config, {"link": {"speed_mbit": link_mbit, "mtu": mtu}})
+    known = len(settings.cameras) or settings.expected_cameras or _RING
+    report = make_report(settings.link, cameras or known, fps)
+    if as_json:
+        typer.echo(json.dumps(report.to_dict(), indent=2))
+    else:
+        Console(highlight=False).print(render(report))
+    if report.chosen_fps is None:
+        raise typer.Exit(EXIT_FAILED)
+
+
+@contextlib.contextmanager
+def _open_rig(settings: "RigSettings", simulate: int | None, seed: int | None) -> Iterator["Rig"]:
+    """The rig that the options ask for, not begun yet, and its metrics where settings ask for them."""
+    from rig_server.metrics_endpoint import metrics_served
     from rig_server.rig import Rig
 
-    if simulate is None:
-        return Rig.live(settings)
-    return Rig.simulated(simulate, seed or 0, settings=settings)
+    rig = Rig.live(settings) if simulate is None else Rig.simulated(simulate, seed or 0, settings=settings)
+    with contextlib.closing(rig), metrics_served(settings.metrics_address, rig.status):
+        yield rig
 
 
 def _refuse_options_without_effect(

@@ -8,10 +8,12 @@ from pydantic import Field, field_validator, model_validator
 
 from rig_calib.settings import CalibrationSettings
 from rig_protocol.camera import CameraModel
+from rig_protocol.datagram import MIN_DATAGRAM_SIZE
 from rig_protocol.errors import ConfigurationError, DataError
 from rig_protocol.events import Address
 from rig_protocol.rig_folder import RingDrawing, read_json
 from rig_protocol.settings import Settings, load_settings
+from rig_server.synchroniser import Policy
 
 ENVIRONMENT_PREFIX = "RIG_SERVER_"
 CONFIG_PLACES = (Path("rig.toml"), Path("/etc/kinect-rig/rig.toml"))
@@ -60,10 +62,41 @@ class CameraSettings(Settings):
 class SynchroniserSettings(Settings):
     """How frames of free-running cameras are grouped into panoramic frames."""
 
+    policy: Policy = "partial"
+    """`partial`: a set waits for every camera of which a frame is due, up to its deadline. `strict`: only
+    complete sets, at the rate of the slowest camera. `latest`: sets wait one frame period at most; a camera
+    without a new frame repeats its last."""
     max_spread_ms: float | None = Field(None, gt=0, examples=[33.3])
-    """Widest exposure spread of a set; unset: one frame period of the cameras."""
+    """Widest exposure spread of a set; unset: one frame period (`latest`: 1.5 of the slowest camera's)."""
     deadline_ms: float = Field(100.0, gt=0, le=10_000)
-    """How long after one frame period a set waits for a frame that is late before it goes out partial."""
+    """How long after one frame period a set waits for a frame that is late before it goes out partial, or is
+    dropped if `strict`. Not used by `latest`."""
+
+
+class LinkSettings(Settings):
+    """The network between agents and server: what it carries, and what to do when that is too little.
+
+    Agents on this machine load no port and are left out of the sum. `rig-server budget` prints it.
+    """
+
+    speed_mbit: float = Field(1000.0, gt=0, le=400_000)
+    """Speed of the port that this PC hangs on, in Mbit/s."""
+    agent_speed_mbit: float = Field(1000.0, gt=0, le=400_000)
+    """Speed of each agent's own port, in Mbit/s; that of a Raspberry Pi 3 is 100."""
+    mtu: int = Field(1500, ge=MIN_DATAGRAM_SIZE + 28, le=65_535)
+    """Largest IP packet of the network in bytes; beyond 1500 every port and switch must be set up for it."""
+    usable: float = Field(0.95, gt=0, le=1)
+    """Share of a port to plan with; the rest is for resends, clock exchanges and scenes that change."""
+    switch_buffer_kib: int = Field(128, ge=1, le=1 << 20)
+    """What the switch buffers for one port; small ones have 128 to 256 KiB for all."""
+    adapt: bool = True
+    """Step down when the link is too small, and up again; false: refuse what does not fit."""
+    jpeg: bool = True
+    """Whether stepping down may send colour as JPEG; false: go to fewer frames at once."""
+    size_margin: float = Field(1.25, ge=1, le=10)
+    """How much larger than our real test frames to expect images before the first have come."""
+    step_up_s: float = Field(10.0, ge=1, le=3600)
+    """How long more must have fitted the link before it is sent."""
 
 
 class CaptureSettings(Settings):
@@ -86,13 +119,18 @@ class RigSettings(Settings):
     """The rig's key, as `rig-server keygen` made it; unset: ./rig.key, else /etc/kinect-rig/rig.key."""
     insecure: bool = False
     """Take frames of anybody who sends some: only for an isolated bench."""
-    receive_buffer_bytes: int = Field(8 << 20, ge=65_536, le=1 << 30)
+    receive_buffer_bytes: int = Field(32 << 20, ge=65_536, le=1 << 30)
     """Kernel receive buffer to ask for; the kernel's limit is net.core.rmem_max."""
     decoder_threads: int = Field(2, ge=1, le=64)
-    """Threads that decode frames; a pair takes about 3 ms of one core."""
+    """Threads that decode frames; a pair takes about 2 ms of one core."""
+    demosaic: bool = False
+    """Whether the decoder threads make the colour image of every Bayer frame, too; else who needs it does."""
+    metrics: str | None = Field(None, examples=["9100"])
+    """Where Prometheus may ask for metrics, [HOST:]PORT; a port alone is for this machine only."""
     log_level: Literal["DEBUG", "INFO", "WARNING", "ERROR"] = "INFO"
     """What is worth a line in the log."""
     synchroniser: SynchroniserSettings = SynchroniserSettings()
+    link: LinkSettings = LinkSettings()
     capture: CaptureSettings = CaptureSettings()
     calibration: CalibrationSettings = CalibrationSettings()
     ring: RingSettings | None = None
@@ -104,6 +142,18 @@ class RigSettings(Settings):
     @classmethod
     def _listen_is_an_address(cls, text: str) -> str:
         parse_address(text)
+        return text
+
+    @field_validator("metrics", mode="before")
+    @classmethod
+    def _metrics_may_be_a_number(cls, value: object) -> object:
+        return str(value) if isinstance(value, int) else value
+
+    @field_validator("metrics")
+    @classmethod
+    def _metrics_is_an_address(cls, text: str | None) -> str | None:
+        if text is not None:
+            parse_metrics_address(text)
         return text
 
     @model_validator(mode="after")
@@ -121,6 +171,11 @@ class RigSettings(Settings):
     def address(self) -> Address:
         """`listen` as (host, port)."""
         return parse_address(self.listen)
+
+    @property
+    def metrics_address(self) -> Address | None:
+        """`metrics` as (host, port); None when nobody may ask."""
+        return None if self.metrics is None else parse_metrics_address(self.metrics)
 
 
 def load_rig_settings(file: Path | None, overrides: Mapping[str, Any] | None = None) -> RigSettings:
@@ -140,6 +195,14 @@ def parse_address(text: str) -> Address:
     if not port_text.isdecimal() or not 0 <= int(port_text) <= 65_535:
         raise ValueError(f"{text!r} is not HOST:PORT with a port from 0 to 65535")
     return host or "0.0.0.0", int(port_text)  # noqa: S104  # an empty host means all interfaces, as in `:4012`
+
+
+def parse_metrics_address(text: str) -> Address:
+    """[HOST:]PORT; without a host only this machine may ask. ValueError says what is wrong with it."""
+    host, _, port = text.rpartition(":")
+    if not port.isdecimal() or text.startswith(":"):
+        raise ValueError(f"{text!r} is not PORT or HOST:PORT; for all interfaces write 0.0.0.0:PORT")
+    return parse_address(f"{host or '127.0.0.1'}:{port}")
 
 
 def read_intrinsics(path: Path) -> CameraModel:

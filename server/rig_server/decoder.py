@@ -6,19 +6,27 @@ from collections import Counter, deque
 from collections.abc import Callable
 from typing import Any
 
-from rig_protocol.codecs import COLOR_CODECS, DEPTH_CODECS, codec, warm_up
+import cv2
+import numpy as np
+
+from rig_protocol.codecs import COLOR_CODECS, DEPTH_CODECS, codec, keep_freed_memory, warm_up
 from rig_protocol.errors import DataError
 from rig_protocol.frames import EncodedFrame, Payload, RgbdFrame
 
 logger = logging.getLogger(__name__)
 
 
-def decode_frame(frame: EncodedFrame) -> RgbdFrame:
-    """Decode both images; DataError when a payload is malformed or in a codec of the other stream."""
+def decode_frame(frame: EncodedFrame, demosaic: bool = False) -> RgbdFrame:
+    """Decode both images; `demosaic` adds the colour image of a Bayer mosaic.
+
+    DataError when a payload is malformed or in a codec of the other stream.
+    """
     images: dict[str, Any] = {}
     for payload, known in ((frame.color, COLOR_CODECS), (frame.depth, DEPTH_CODECS)):
         if payload is not None:
             images |= _decode_payload(payload, known)
+    if demosaic and "bayer" in images:
+        images["color"] = np.asarray(cv2.cvtColor(images["bayer"], cv2.COLOR_BayerGRBG2BGR), np.uint8)
     return RgbdFrame(
         camera_id=frame.camera_id,
         sequence=frame.sequence,
@@ -48,13 +56,24 @@ class FrameDecoder:
     of twelve cameras at 30 Hz, beyond which the server does not keep up and old frames lose their worth.
     """
 
-    def __init__(self, deliver: Callable[[RgbdFrame], None], *, threads: int = 2, capacity: int = 36) -> None:
+    def __init__(
+        self,
+        deliver: Callable[[RgbdFrame], None],
+        *,
+        threads: int = 2,
+        capacity: int = 36,
+        demosaic: bool = False,
+    ) -> None:
         """Starts the threads; the first time on a machine it compiles for some seconds."""
         if threads < 1 or capacity < 1:
             raise ValueError(f"threads {threads} and capacity {capacity} must be positive")
         warm_up()
+        keep_freed_memory()
+        if demosaic:  # one image a call is too little for OpenCV's own threads, which take turns with ours
+            cv2.setNumThreads(1)
         self._deliver = deliver
         self._capacity = capacity
+        self._demosaic = demosaic
         self._waiting: deque[EncodedFrame] = deque()
         self._busy: set[int] = set()
         self._changed = threading.Condition()
@@ -66,6 +85,11 @@ class FrameDecoder:
         ]
         for thread in self._threads:
             thread.start()
+
+    @property
+    def waiting(self) -> int:
+        """Frames that wait for a thread."""
+        return len(self._waiting)
 
     @property
     def dropped_by_camera(self) -> Counter[int]:
@@ -112,7 +136,7 @@ class FrameDecoder:
     def _run(self) -> None:
         while (frame := self._take()) is not None:
             try:
-                self._deliver(decode_frame(frame))
+                self._deliver(decode_frame(frame, self._demosaic))
             except DataError as error:
                 with self._changed:
                     self._undecodable[frame.camera_id] += 1

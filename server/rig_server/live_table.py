@@ -11,8 +11,15 @@ from rich.table import Table
 from rich.text import Text
 
 from rig_server.metrics import CameraMetrics, RigStatus
+from rig_server.status_words import summary
 
 _LINE_EVERY_S = 5.0
+
+# From here on a figure is a trouble of its own and stands out.
+_HIGH_LOSS = 0.001  # a complete set in a thousand is missing for it
+_HIGH_CLOCK_ERROR_US = 500.0
+_HIGH_TEMPERATURE_C = 80.0  # a Pi slows down
+_CALM, _PLAIN, _TROUBLE = "dim", "", "bold not dim yellow"
 
 
 class LiveDisplay:
@@ -47,25 +54,31 @@ class LiveDisplay:
 
 
 def status_table(status: RigStatus, title: str) -> RenderableType:
-    """One line a camera and a footer; fits 80 columns."""
+    """One line a camera and a footer; fits 80 columns. What is in order is dim, what is not stands out."""
     hot = any(camera.temperature_c is not None for camera in status.cameras)
     table = Table(
         title=title, title_justify="left", box=box.SIMPLE_HEAD, pad_edge=False, padding=(0, 1, 0, 0)
     )
     table.add_column("camera", no_wrap=True, max_width=14)
-    for heading in ("fps", "lost %", "late", "damaged", "corrupt", "twice", "clock ±µs", *["°C"] * hot):
+    headings = ("fps", "lost %", "late", "damaged", "corrupt", "resent", "twice", "±µs", *["°C"] * hot)
+    for heading in headings:
         table.add_column(heading, justify="right", no_wrap=True)
     for camera in status.cameras:
-        table.add_row(*_cells(camera, hot), style="" if camera.connected else "dim")
-    footer = _footer(status) if status.cameras else ["waiting for cameras"]
-    return Group(table, *map(Text, footer))
+        table.add_row(*_cells(camera, hot), style=_PLAIN if camera.connected else _CALM)
+    figures, troubles = summary(status)
+    if not status.cameras:
+        figures = ["waiting for cameras"]
+    return Group(table, *map(Text, figures), *(Text(line, _TROUBLE) for line in troubles))
 
 
 def status_line(status: RigStatus) -> str:
     """The same in one line, for a log."""
-    away = [camera.name for camera in status.cameras if not camera.connected]
-    parts = [f"{status.connected}/{len(status.cameras)} cameras", *_footer(status)]
-    if away:
+    figures, troubles = summary(status)
+    parts = [f"{status.connected}/{len(status.cameras)} cameras", *figures]
+    if resent := sum(camera.resent for camera in status.cameras):
+        parts.append(f"{resent} fragments resent")
+    parts += troubles
+    if away := [camera.name for camera in status.cameras if not camera.connected]:
         parts.append(f"not connected: {', '.join(away)}")
     worst = max(status.cameras, key=lambda camera: camera.loss, default=None)
     if worst is not None and worst.loss:
@@ -73,31 +86,34 @@ def status_line(status: RigStatus) -> str:
     return "; ".join(parts)
 
 
-def _cells(camera: CameraMetrics, hot: bool) -> list[str]:
+def _cells(camera: CameraMetrics, hot: bool) -> list[Text]:
     cells = [
-        camera.name,
-        f"{camera.fps:.1f}" if camera.connected else "away",
-        f"{100 * camera.loss:.2f}",
-        str(camera.late),
-        str(camera.damaged),
-        str(camera.corrupt),
-        str(camera.duplicate),
-        "–" if camera.clock_error_us is None else f"{camera.clock_error_us:.0f}",
+        Text(camera.name),
+        Text(f"{camera.fps:.1f}") if camera.connected else Text("away", _TROUBLE),
+        _figure(f"{100 * camera.loss:.2f}", camera.loss, _HIGH_LOSS),
+        *(_count(count) for count in (camera.late, camera.damaged, camera.corrupt)),
+        *(_count(count) for count in (camera.resent, camera.duplicate)),
+        _measured(camera.clock_error_us, _HIGH_CLOCK_ERROR_US),
     ]
     if hot:
-        cells.append("–" if camera.temperature_c is None else f"{camera.temperature_c:.0f}")
+        cells.append(_measured(camera.temperature_c, _HIGH_TEMPERATURE_C))
     return cells
 
 
-def _footer(status: RigStatus) -> list[str]:
-    names = {camera.camera_id: camera.name for camera in status.cameras}
-    spread = "" if status.spread_ms is None else f", spread {status.spread_ms:.1f} ms"
-    sets = f"{status.sets_per_s:.1f} sets/s{spread}, {status.complete} complete, {status.partial} partial"
-    missing = ", ".join(names.get(camera_id, str(camera_id)) for camera_id in status.often_missing)
-    dropped = ", ".join(f"{name} {count}" for name, count in status.dropped.items() if count)
-    lines = [sets]
-    if missing:
-        lines.append(f"often missing: {missing}")
-    if dropped:
-        lines.append(f"dropped: {dropped}")
-    return lines
+def _count(count: int) -> Text:
+    return Text(_short(count), _PLAIN if count else _CALM)
+
+
+def _measured(value: float | None, high: float) -> Text:
+    return Text("–", _CALM) if value is None else _figure(_short(round(value)), value, high, calm=_PLAIN)
+
+
+def _figure(shown: str, value: float, high: float, calm: str = _CALM) -> Text:
+    return Text(shown, _TROUBLE if value >= high else _PLAIN if value else calm)
+
+
+def _short(count: int) -> str:
+    """At most four characters: 9999, 123k, 12M."""
+    if count < 10_000:
+        return str(count)
+    return f"{count // 1000}k" if count < 1_000_000 else f"{count // 1_000_000}M"

@@ -1,22 +1,30 @@
 """What the operator is told of the running rig: one line a camera, and the sets."""
 
 import statistics
-from collections import deque
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
+from rig_protocol.clock_sync import ClockEstimate
 from rig_server.assembler import SetRecord
+from rig_server.histogram import HistogramSnapshot
+from rig_server.sample_window import SampleWindow
+from rig_server.synchroniser import IncompleteSet
 
 TEMPERATURE = "temperature_c"  # the gauge of an agent's heartbeat that has a column of its own
 _RATE_WINDOW_NS = 3_000_000_000
+_RATE_SPACING_NS = 100_000_000
 
 
 @dataclass(frozen=True, slots=True)
 class CameraMetrics:
     """One camera. Rates are of the last three seconds, counts since the server started.
 
-    `late`: frames whose set had gone. `corrupt`: frames whose checksum or payload failed.
-    `duplicate`: fragments that came twice. `clock_error_us`: standard uncertainty of its stamps in rig time.
+    `late`: frames whose set had gone. `corrupt`: frames whose seal or payload failed.
+    `duplicate`: fragments that came twice. `resent`: fragments that came because we asked for them again.
+    `clock_error_us`: standard uncertainty of its stamps in rig time. `counters`: all of `CameraCounters`, by
+    name. `dropped`: frames that came whole and entered no set, by cause. `gauges`: what the agent tells of
+    itself.
     """
 
     camera_id: int
@@ -29,8 +37,13 @@ class CameraMetrics:
     damaged: int = 0
     duplicate: int = 0
     corrupt: int = 0
+    resent: int = 0
     clock_error_us: float | None = None
     temperature_c: float | None = None
+    counters: Mapping[str, int] = field(default_factory=dict)
+    dropped: Mapping[str, int] = field(default_factory=dict)
+    gauges: Mapping[str, float] = field(default_factory=dict)
+    clock: ClockEstimate | None = None
 
     @property
     def loss(self) -> float:
@@ -40,7 +53,14 @@ class CameraMetrics:
 
 @dataclass(frozen=True, slots=True)
 class RigStatus:
-    """The rig at one moment; `dropped` names frames, sets and datagrams lost beside the cameras' own."""
+    """The rig at one moment.
+
+    `dropped` names frames, sets and datagrams lost beside the cameras' own, `rejected` datagrams that belong
+    to no camera, by cause. `repeated`: frames that went out once more. `queues`: frames or sets that wait, by
+    place; `unread_bytes`: how much of the kernel's receive buffer is taken. `durations`: histograms since the
+    start, by the names in `rig_server.durations`; `recent`: the same of the last half minute. `link`: what is
+    sent and what that takes, in words.
+    """
 
     cameras: tuple[CameraMetrics, ...]
     complete: int = 0
@@ -49,6 +69,14 @@ class RigStatus:
     spread_ms: float | None = None
     often_missing: tuple[int, ...] = ()
     dropped: Mapping[str, int] = field(default_factory=dict)
+    repeated: int = 0
+    rejected: Mapping[str, int] = field(default_factory=dict)
+    queues: Mapping[str, int] = field(default_factory=dict)
+    unread_bytes: int = 0
+    durations: Mapping[str, HistogramSnapshot] = field(default_factory=dict)
+    recent: Mapping[str, HistogramSnapshot] = field(default_factory=dict)
+    link: str | None = None
+    authenticated: bool = False
 
     @property
     def connected(self) -> int:
@@ -60,29 +88,40 @@ class RateMeter:
     """Frames a second of every camera, from their counts at moments up to three seconds ago."""
 
     def __init__(self) -> None:
-        self._samples: deque[tuple[int, Mapping[int, int]]] = deque()
+        self._window: SampleWindow[Mapping[int, int]] = SampleWindow(_RATE_WINDOW_NS, _RATE_SPACING_NS)
 
     def update(self, frames: Mapping[int, int], now_ns: int) -> dict[int, float]:
         """Rates by camera id; 0.0 until two samples hold the camera."""
-        self._samples.append((now_ns, frames))
-        while self._samples[0][0] < now_ns - _RATE_WINDOW_NS and len(self._samples) > 2:
-            self._samples.popleft()
-        return {camera_id: self._rate(camera_id) for camera_id in frames}
-
-    def _rate(self, camera_id: int) -> float:
-        known = [(time_ns, counts[camera_id]) for time_ns, counts in self._samples if camera_id in counts]
-        (start_ns, first), (end_ns, last) = known[0], known[-1]
-        return (last - first) * 1e9 / (end_ns - start_ns) if end_ns > start_ns else 0.0
+        samples = self._window.add(frames, now_ns)
+        return {camera_id: _rate(camera_id, samples) for camera_id in frames}
 
 
-def summarise_sets(recent: Sequence[SetRecord], now_ns: int) -> tuple[float, float | None, tuple[int, ...]]:
-    """Sets a second, median spread in ms, and the cameras missing from at least a tenth, worst first."""
-    fresh = [record for record in recent if record.delivered_ns >= now_ns - _RATE_WINDOW_NS]
+def summarise_sets(
+    recent: Sequence[SetRecord], now_ns: int, incomplete: Sequence[IncompleteSet] = ()
+) -> tuple[float, float | None, tuple[int, ...]]:
+    """Sets a second, median spread in ms, and the cameras missing from at least a tenth, worst first.
+
+    `incomplete`: sets that did not go out; their cameras are named too.
+    """
+    since_ns = now_ns - _RATE_WINDOW_NS
+    fresh = [record for record in recent if record.delivered_ns >= since_ns]
+    lacking = [record.missing for record in fresh]
+    lacking += [record.missing for record in incomplete if record.decided_ns >= since_ns]
+    ranked = _often_missing(lacking)
     if not fresh:
-        return 0.0, None, ()
+        return 0.0, None, ranked
     elapsed_ns = max(now_ns - fresh[0].delivered_ns, 1)
     rate = (len(fresh) - 1) * 1e9 / elapsed_ns
-    absent = [camera_id for record in fresh for camera_id in record.missing]
-    often = {camera_id for camera_id in absent if 10 * absent.count(camera_id) >= len(fresh)}
-    ranked = sorted(often, key=lambda camera_id: (-absent.count(camera_id), camera_id))
-    return rate, statistics.median(record.spread_ns for record in fresh) / 1e6, tuple(ranked)
+    return rate, statistics.median(record.spread_ns for record in fresh) / 1e6, ranked
+
+
+def _often_missing(lacking: Sequence[tuple[int, ...]]) -> tuple[int, ...]:
+    absent = Counter(camera_id for missing in lacking for camera_id in missing)
+    often = [camera_id for camera_id, count in absent.items() if 10 * count >= len(lacking)]
+    return tuple(sorted(often, key=lambda camera_id: (-absent[camera_id], camera_id)))
+
+
+def _rate(camera_id: int, samples: Sequence[tuple[int, Mapping[int, int]]]) -> float:
+    known = [(time_ns, counts[camera_id]) for time_ns, counts in samples if camera_id in counts]
+    (start_ns, first), (end_ns, last) = known[0], known[-1]
+    return (last - first) * 1e9 / (end_ns - start_ns) if end_ns > start_ns else 0.0

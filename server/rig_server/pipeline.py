@@ -16,24 +16,30 @@ from rig_protocol.events import (
     HelloRefused,
     ServerEvent,
 )
-from rig_protocol.frames import PanoramicFrame
+from rig_protocol.frames import PanoramicFrame, RgbdFrame
 from rig_protocol.messages import Hello
 from rig_protocol.rig_folder import RigDescription
 from rig_protocol.rig_key import RigKey
 from rig_protocol.roster import Roster, Slot
 from rig_protocol.server_link import ServerLink
-from rig_protocol.server_session import CameraStatus
+from rig_protocol.system_clock import SystemClock
 from rig_server.assembler import Assembler
 from rig_server.attendance import absence_message, is_whole
 from rig_server.config import RigSettings
 from rig_server.decoder import FrameDecoder
-from rig_server.description import camera_names, describe_rig
-from rig_server.metrics import TEMPERATURE, CameraMetrics, RateMeter, RigStatus, summarise_sets
+from rig_server.description import describe_rig
+from rig_server.durations import Durations
+from rig_server.link_budget import Port
+from rig_server.metrics import RigStatus
 from rig_server.receiver import Receiver, rig_time_ns
+from rig_server.rig_status import StatusReader
+from rig_server.stream_control import StreamControl
+from rig_server.stream_planner import StreamPlanner
 from rig_server.synchroniser import Synchroniser
 
 logger = logging.getLogger(__name__)
 
+_SYSTEM_CLOCK_INTERVAL_NS = 1_000_000_000
 _REFUSALS = 8  # the latest refused hellos, for the message about cameras that do not come
 
 
@@ -48,18 +54,40 @@ class LivePipeline:
 
     def __init__(self, settings: RigSettings, key: RigKey) -> None:
         self._settings = settings
-        self._assembler = Assembler(_synchroniser(settings))
+        self._durations = Durations()
+        self._assembler = Assembler(_synchroniser(settings), self._durations.set_delivered)
         self._link = ServerLink(
             _roster(settings),
             key,
             secrets.token_bytes,
             color_codecs=COLOR_CODECS,
             depth_codecs=DEPTH_CODECS,
+            datagram_size=Port(settings.link.speed_mbit, settings.link.mtu).datagram_size,
         )
-        self._receiver = Receiver(self._link, settings.address, self._on_event, settings.receive_buffer_bytes)
+        expected = len(settings.cameras) or settings.expected_cameras
+        self._streams = StreamControl(self._link, StreamPlanner(settings.link, expected))
+        self._receiver = Receiver(
+            self._link,
+            settings.address,
+            self._on_event,
+            settings.receive_buffer_bytes,
+            on_turn=self._on_turn,
+        )
         # After the port is ours: its first construction on a machine compiles for seconds.
-        self._decoder = FrameDecoder(self._assembler.add, threads=settings.decoder_threads)
-        self._rates = RateMeter()
+        self._decoder = FrameDecoder(
+            self._on_frame, threads=settings.decoder_threads, demosaic=settings.demosaic
+        )
+        self._status = StatusReader(
+            settings,
+            self._link,
+            self._receiver,
+            self._decoder,
+            self._assembler,
+            self._durations,
+            self._streams,
+        )
+        self._system_clock = SystemClock(rig_time_ns, time.time_ns)
+        self._system_clock_read_ns = 0
         self._presence = threading.Lock()  # guards what follows
         self._connected: set[int] = set()
         self._hellos: dict[int, Hello] = {}
@@ -111,31 +139,21 @@ class LivePipeline:
         return self._assembler.next_panorama(timeout_s)
 
     def status(self) -> RigStatus:
-        """The rig at this moment."""
-        now_ns = rig_time_ns()
-        cameras = dict(self._link.cameras)
-        rates = self._rates.update({i: camera.counters.frames for i, camera in cameras.items()}, now_ns)
-        names = camera_names(self._settings, self.hellos)
-        sets_per_s, spread_ms, often_missing = summarise_sets(self._assembler.recent, now_ns)
-        return RigStatus(
-            cameras=tuple(
-                self._metrics(camera_id, name, cameras.get(camera_id), rates.get(camera_id, 0.0))
-                for camera_id, name in sorted(names.items())
-            ),
-            complete=self._assembler.complete,
-            partial=self._assembler.partial,
-            sets_per_s=sets_per_s,
-            spread_ms=spread_ms,
-            often_missing=often_missing,
-            dropped=self._dropped(),
-        )
+        """The rig at this moment; any thread may ask."""
+        return self._status.read(self.hellos)
 
     def _check_receiver(self) -> None:
         if self._receiver.failure is not None:
             raise RigError(f"receiving stopped: {self._receiver.failure!r}") from self._receiver.failure
 
+    def _on_frame(self, frame: RgbdFrame) -> None:
+        """On a decoder's thread."""
+        self._durations.frame_decoded(frame, rig_time_ns())
+        self._assembler.add(frame)
+
     def _on_event(self, event: ServerEvent) -> None:
         """On the receiver's thread: nothing here may wait."""
+        self._streams.take(event, rig_time_ns())
         match event:
             case FrameReceived(frame):
                 self._decoder.submit(frame)
@@ -158,35 +176,12 @@ class LivePipeline:
                     self._refusals.append(event)
                 logger.log(logging.DEBUG if told else logging.WARNING, "refused %s: %s", address[0], text)
 
-    def _metrics(self, camera_id: int, name: str, camera: CameraStatus | None, fps: float) -> CameraMetrics:
-        if camera is None:
-            return CameraMetrics(camera_id, name, connected=False)
-        counters, clock = camera.counters, camera.clock
-        return CameraMetrics(
-            camera_id,
-            name,
-            camera.connected,
-            fps=fps,
-            frames=counters.frames,
-            lost=counters.lost,
-            late=self._assembler.late(camera_id),
-            damaged=counters.damaged,
-            duplicate=counters.duplicate,
-            corrupt=counters.corrupt + self._decoder.undecodable_by_camera[camera_id],
-            clock_error_us=None if clock is None else clock.uncertainty_ns / 1e3,
-            temperature_c=camera.health.get(TEMPERATURE),
-        )
-
-    def _dropped(self) -> dict[str, int]:
-        return {
-            "sets not taken": self._assembler.overrun,
-            "frames left out of sets": self._assembler.skipped,
-            "frames of implausible time": self._assembler.implausible,
-            "frames not decoded in time": self._decoder.dropped,
-            "datagrams by the kernel": self._receiver.kernel_drops,
-            "datagrams of no camera": sum(self._link.rejected.values()),
-            "answers that the network refused": self._receiver.unsent,
-        }
+    def _on_turn(self, now_ns: int) -> None:
+        """On the receiver's thread, after every wake-up."""
+        self._streams.turn(now_ns)
+        if abs(now_ns - self._system_clock_read_ns) >= _SYSTEM_CLOCK_INTERVAL_NS:
+            self._system_clock_read_ns = now_ns
+            self._link.system_clock = self._system_clock.read()
 
 
 def _synchroniser(settings: RigSettings) -> Synchroniser:
@@ -195,6 +190,7 @@ def _synchroniser(settings: RigSettings) -> Synchroniser:
         (camera.id for camera in settings.cameras),
         deadline_ns=int(options.deadline_ms * 1e6),
         max_spread_ns=None if options.max_spread_ms is None else int(options.max_spread_ms * 1e6),
+        policy=options.policy,
     )
 
 

@@ -16,7 +16,7 @@ from typing import Protocol
 from rig_protocol.datagram import DatagramBatch
 from rig_protocol.events import Address, ServerEvent
 from rig_server.gatherer import Gatherer
-from rig_server.udp_socket import ask_for_receive_buffer, bound_udp_socket, switch_on
+from rig_server.udp_socket import ask_for_receive_buffer, bound_udp_socket, switch_on, waiting_bytes
 
 logger = logging.getLogger(__name__)
 
@@ -69,8 +69,8 @@ class Link(Protocol):
 class Receiver:
     """Binds on construction, runs the link in a thread from `start` to `stop`.
 
-    `on_event` is called on the receiver's thread for every event and must not block. After a failure of
-    the socket the thread ends and `failure` holds the reason.
+    On the receiver's thread `on_event` is called for every event, `on_turn` with the rig time after every
+    wake-up; neither must block. After a failure of the socket the thread ends and `failure` holds the reason.
     """
 
     def __init__(
@@ -80,9 +80,10 @@ class Receiver:
         on_event: Callable[[ServerEvent], None],
         receive_buffer_bytes: int,
         use_gro: bool = True,
+        on_turn: Callable[[int], None] = lambda now_ns: None,  # noqa: ARG005  # the default does nothing
     ) -> None:
         self._link = link
-        self._on_event = on_event
+        self._on_event, self._on_turn = on_event, on_turn
         self._socket = bound_udp_socket(address)
         self.receive_buffer_bytes = ask_for_receive_buffer(self._socket, receive_buffer_bytes)
         self.merges = use_gro and switch_on(self._socket, socket.IPPROTO_UDP, _UDP_GRO)
@@ -101,6 +102,11 @@ class Receiver:
         """Where the socket is bound; the port is the real one when 0 was asked for."""
         host, port = self._socket.getsockname()[:2]
         return str(host), int(port)
+
+    @property
+    def waiting_bytes(self) -> int:
+        """How much of the kernel's receive buffer is taken."""
+        return waiting_bytes(self._socket)
 
     def start(self) -> None:
         """Start receiving."""
@@ -174,6 +180,7 @@ class Receiver:
         if due_ns is not None and due_ns <= now_ns:
             self._link.handle_timeout(now_ns)
         self._deliver_events()
+        self._on_turn(now_ns)
         self._transmit()
 
     def _deliver_events(self) -> None:

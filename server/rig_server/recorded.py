@@ -78,10 +78,4 @@ class RecordedRig:
             camera.id: read_frame(self._folder, camera, index) if index in self._indices[camera.id] else None
             for camera in self.description.cameras
         }
-        times_ns = [frame.timestamp_ns for frame in frames.values() if frame is not None]
-        return PanoramicFrame(
-            index=index,
-            timestamp_ns=sum(times_ns) // len(times_ns),
-            frames=frames,
-            spread_ns=max(times_ns) - min(times_ns),
-        )
+        return PanoramicFrame.of(index, frames)

@@ -3,13 +3,17 @@
 import errno
 import logging
 import socket
+import struct
 
 from rig_protocol.errors import ConfigurationError, RigError
 from rig_protocol.events import Address
 
 logger = logging.getLogger(__name__)
 
-_SO_RCVBUFFORCE = 33  # <asm-generic/socket.h>; Python does not name it
+# <asm-generic/socket.h>, <linux/sock_diag.h>: Python names none of them.
+_SO_RCVBUFFORCE = 33
+_SO_MEMINFO = 55
+_MEMINFO_SIZE = 36  # nine counts of 32 bits; the first is what the receive queue takes
 
 
 def bound_udp_socket(address: Address) -> socket.socket:
@@ -26,16 +30,19 @@ def bound_udp_socket(address: Address) -> socket.socket:
         bound.bind(where)
     except OSError as error:
         bound.close()
-        raise _bind_error(error, host, port) from error
-    return bound
-
-
-def _bind_error(error: OSError, host: str, port: int) -> RigError:
-    if error.errno == errno.EADDRINUSE:
-        return RigError(
+        in_use = (
             f"UDP port {port} is in use: stop the other rig-server "
             f"(`systemctl stop rig-server`, `ss -ulpn sport = :{port}`) or choose another with --listen"
         )
+        raise bind_error(error, address, in_use) from error
+    return bound
+
+
+def bind_error(error: OSError, address: Address, in_use: str) -> RigError:
+    """What to tell the operator when a socket cannot be bound; `in_use`: when the port is taken."""
+    host, port = address
+    if error.errno == errno.EADDRINUSE:
+        return RigError(in_use)
     if error.errno == errno.EADDRNOTAVAIL:
         return ConfigurationError(f"no interface of this machine has address {host}: see `ip addr`")
     return ConfigurationError(f"cannot listen on {host}:{port}: {error.strerror}")
@@ -61,6 +68,15 @@ def ask_for_receive_buffer(bound: socket.socket, wanted: int) -> int:
 def _granted(bound: socket.socket) -> int:
     """The kernel doubles what was asked for to hold its own book-keeping, and reports the double."""
     return bound.getsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF) // 2
+
+
+def waiting_bytes(bound: socket.socket) -> int:
+    """How much of the kernel's receive buffer is taken; 0 where it does not tell."""
+    try:
+        counts = bound.getsockopt(socket.SOL_SOCKET, _SO_MEMINFO, _MEMINFO_SIZE)
+        return int(struct.unpack_from("=I", counts)[0])
+    except (OSError, struct.error):  # closed, or an old kernel
+        return 0
 
 
 def switch_on(bound: socket.socket, level: int, option: int) -> bool:

@@ -1,4 +1,4 @@
-"""The payloads of codec layout 1, pinned: whatever encoder wrote them, every decoder reads them."""
+"""The payloads of codec layout 2, pinned: whatever encoder wrote them, every decoder reads them."""
 
 import base64
 import json
@@ -10,7 +10,7 @@ import pytest
 from rig_protocol.codecs import COLOR_CODECS, DEPTH_CODECS, codec, codec_by_name
 from support.images import Image, empty_of
 
-PAYLOADS = json.loads((Path(__file__).parent / "codecs_v1.json").read_text())
+PAYLOADS = json.loads((Path(__file__).parent / "codecs_v2.json").read_text())
 
 
 def pinned_image(name: str) -> Image:

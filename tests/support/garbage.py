@@ -31,4 +31,4 @@ def _wait_for_count(rig: Rig, count: int) -> None:
 
 
 def _counted(rig: Rig) -> int:
-    return rig.status().dropped["datagrams of no camera"]
+    return sum(rig.status().rejected.values())

@@ -1,32 +1,28 @@
 """Real agents and servers as processes, real sockets on loopback, and waiting for what they do."""
 
-import atexit
 import re
-import secrets
 import signal
 import socket
 import subprocess
 import sys
-import tempfile
 import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from functools import cache
 from pathlib import Path
 
 import numpy as np
 
 from rig_protocol.camera import CameraModel
 from rig_protocol.frames import PanoramicFrame, RgbdFrame
-from rig_protocol.key_file import write_key
 from rig_protocol.rig_folder import CameraEntry, RigDescription, RingDrawing, write_rig_folder
-from rig_protocol.rig_key import RigKey
 from rig_server import Rig
 from rig_server.config import CameraSettings, RigSettings
+from support.key_for_tests import rig_key_file
 
 LOOPBACK = "127.0.0.1"
 START_TIMEOUT_S = 60.0  # a dozen interpreters start at once on two busy cores
 _STOP_TIMEOUT_S = 10.0
+_STEPPING_CLOCK = Path(__file__).with_name("stepping_clock.py")
 
 
 def free_port() -> int:
@@ -43,24 +39,28 @@ def server_settings(port: int, cameras: int, **changes: object) -> RigSettings:
     return RigSettings.model_validate(options | changes)
 
 
-@cache
-def rig_key_file() -> Path:
-    """The key that servers and agents of one test run share."""
-    folder = tempfile.TemporaryDirectory(prefix="rig-key-")
-    atexit.register(folder.cleanup)
-    write_key(path := Path(folder.name) / "rig.key", RigKey.generate(secrets.token_bytes))
-    return path
-
-
 class AgentProcess:
     """One `rig-agent`, restartable; everything it prints goes to its log."""
 
     def __init__(
-        self, log: Path, port: int, options: Sequence[object], env: Mapping[str, str] | None = None
+        self,
+        log: Path,
+        port: int,
+        options: Sequence[object],
+        env: Mapping[str, str] | None = None,
+        *,
+        host: str = LOOPBACK,
+        prefix: Sequence[str] = (),
+        stepping: bool = False,
     ) -> None:
+        """`host` is the server's; `prefix` runs the agent elsewhere: ip netns exec NAME.
+
+        `stepping`: SIGUSR1 and SIGUSR2 make its clock jump (support/stepping_clock.py).
+        """
         self._log, self._env = log, env
+        program = [str(_STEPPING_CLOCK), "rig_agent.cli"] if stepping else ["-m", "rig_agent.cli"]
         self._words = [
-            *(sys.executable, "-m", "rig_agent.cli", "--server", f"{LOOPBACK}:{port}"),
+            *(*prefix, sys.executable, *program, "--server", f"{host}:{port}"),
             *("--key-file", str(rig_key_file())),
             *map(str, options),
         ]
@@ -79,6 +79,11 @@ class AgentProcess:
         assert self._process is not None
         self._process.kill()
         self._process.wait()
+
+    def send_signal(self, number: int) -> None:
+        """Any signal."""
+        assert self._process is not None
+        self._process.send_signal(number)
 
     def stop(self) -> int:
         """As systemd does; the exit status."""
@@ -108,7 +113,14 @@ class AgentProcess:
 
 @contextmanager
 def folder_agents(
-    folder: Path, logs: Path, port: int, cameras: Sequence[int], fps: float = 10.0
+    folder: Path,
+    logs: Path,
+    port: int,
+    cameras: Sequence[int],
+    fps: float = 10.0,
+    *,
+    host: str = LOOPBACK,
+    prefix: Callable[[int], Sequence[str]] = lambda _camera: (),
 ) -> Iterator[dict[int, AgentProcess]]:
     """Agents that each play one camera of a rig folder; stopped at the end, whatever happened."""
     agents = {
@@ -116,6 +128,8 @@ def folder_agents(
             logs / f"agent{camera:02d}.log",
             port,
             ["--source", "folder", "--path", folder, "--camera", camera, "--fps", fps],
+            host=host,
+            prefix=prefix(camera),
         )
         for camera in cameras
     }
@@ -128,7 +142,9 @@ def folder_agents(
             agent.kill()
 
 
-def write_small_rig(folder: Path, cameras: int = 12, frames: int = 2) -> list[RgbdFrame]:
+def write_small_rig(
+    folder: Path, cameras: int = 12, frames: int = 2, shape: tuple[int, int] = (120, 160)
+) -> list[RgbdFrame]:
     """A rig folder of small random images, every one different; the frames that it holds."""
     rng = np.random.default_rng(cameras)
     ring = RingDrawing()
@@ -138,8 +154,8 @@ def write_small_rig(folder: Path, cameras: int = 12, frames: int = 2) -> list[Rg
             camera_id=camera,
             sequence=index,
             timestamp_ns=0,
-            color=rng.integers(0, 256, (120, 160, 3), dtype=np.uint8),
-            raw=rng.integers(0, 2048, (120, 160), dtype=np.uint16),
+            color=rng.integers(0, 256, (*shape, 3), dtype=np.uint8),
+            raw=rng.integers(0, 2048, shape, dtype=np.uint16),
         )
         for camera in range(cameras)
         for index in range(frames)

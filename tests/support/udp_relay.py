@@ -1,5 +1,6 @@
 """A bad network between real sockets: a relay before the server that harms datagrams as LossyLink does."""
 
+import collections
 import selectors
 import socket
 import threading
@@ -24,6 +25,7 @@ class UdpRelay:
         self.port = int(self._front.getsockname()[1])
         self._selector.register(self._front, selectors.EVENT_READ)
         self._clients: dict[tuple[str, int], _Client] = {}
+        self.unplugged = threading.Event()  # while set, nothing passes in either direction
         self._stop = threading.Event()
         self._thread = threading.Thread(target=self._run, name="udp-relay")
 
@@ -76,6 +78,11 @@ class UdpRelay:
 
     def _deliver(self) -> None:
         now_ns = time.monotonic_ns()
+        if self.unplugged.is_set():
+            for client in self._clients.values():
+                for link in (client.up, client.down):
+                    collections.deque(link.arrivals(now_ns), maxlen=0)
+            return
         for address, client in self._clients.items():
             for datagram in client.up.arrivals(now_ns):
                 client.send_to_server(datagram)

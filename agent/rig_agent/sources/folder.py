@@ -75,6 +75,7 @@ class FolderSource:
         behind = now_ns // self._interval_ns - self._next
         if behind > 0:
             self._counters["skipped"] += behind
+        if behind > 0 or behind < -2:  # -1 is on time, less: the clock was set back
             self._next += behind
         wait_s = (self._next * self._interval_ns - now_ns) / 1e9
         if wait_s > timeout_s:

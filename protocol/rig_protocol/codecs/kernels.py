@@ -1,8 +1,9 @@
 """Decoding loops compiled to machine code, on the PC only: the one module of the protocol that needs Numba.
 
-Every loop runs without the interpreter's lock and stays within its arrays whatever the bytes say;
-the caller compares the cursors with the stated lengths afterwards. `pyramid.py` and `depth.py` are the
-encoding side and explain the layout.
+Every loop runs without the interpreter's lock and stays within its arrays whatever the bytes say. The loops
+over a row are written so that the compiler turns them into vector instructions: eight-bit sums of eight-bit
+numbers, no element that waits for the one before. `pyramid.py` and `depth.py` are the encoding side and
+explain the layout.
 """
 
 from collections.abc import Callable
@@ -11,27 +12,33 @@ from typing import ParamSpec, TypeVar
 import numba
 import numpy as np
 import numpy.typing as npt
-from numba import int16, int64, types, uint8, uint16, void
+from numba import int64, types, uint8, uint16, void
 
-from rig_protocol.codecs.pyramid import CONTEXT_LIMITS, LEVELS
+from rig_protocol.codecs.pyramid import LEVELS, MIDDLE
 
 P = ParamSpec("P")
 R = TypeVar("R")
 
 U8 = npt.NDArray[np.uint8]
 U16 = npt.NDArray[np.uint16]
-I16 = npt.NDArray[np.int16]
-I64 = npt.NDArray[np.int64]
-Rows = tuple[I16, I16, I16, I16]
+U64 = npt.NDArray[np.uint64]
 
 # Constants are compiled in, and the cache looks at this file alone: touch it when `pyramid` changes.
-_LIMIT_1, _LIMIT_2, _LIMIT_3 = CONTEXT_LIMITS
-_CENTRES, _COLUMNS, _ROWS = range(3)
-_ESCAPED = 0xFFFE
+_LEVELS = LEVELS
+_MIDDLE = np.uint8(MIDDLE)
+_ZERO, _ONE = np.uint8(0), np.uint8(1)
+_BAND = 8
+"""Rows whose measured pixels share the bytes of a depth image's mask."""
+
+_DE_BRUIJN = np.uint64(0x03F7_9D71_B4CB_0A89)
+"""Its products with the 64 powers of two differ in their upper six bits, each of which so names a bit."""
+_PIXEL_OF_BIT = np.zeros(64, np.uint8)
+for _bit in range(64):
+    _PIXEL_OF_BIT[(int(_DE_BRUIJN) << _bit & 2**64 - 1) >> 58] = _bit // 2
 
 _STREAM = types.Array(uint8, 1, "C", readonly=True)
 _STREAM_IMAGE = types.Array(uint8, 2, "C", readonly=True)
-_I16_IMAGE = int16[:, ::1]
+_COUNTS = types.Tuple((int64, int64))  # type: ignore[no-untyped-call]  # Numba leaves it so
 
 
 def _compiled(signature: object) -> Callable[[Callable[P, R]], Callable[P, R]]:
@@ -54,193 +61,191 @@ def _inlined(function: Callable[P, R]) -> Callable[P, R]:
 
 
 @_inlined
-def _neighbour_rows(band: int, corners: I16, centres: I16, y: int) -> Rows:
-    """The four rows around row y of the centres (0), right of the corners (1) or below them (2)."""
-    if band == _CENTRES:
-        return corners[y, :-1], corners[y, 1:], corners[y + 1, :-1], corners[y + 1, 1:]
-    if band == _COLUMNS:
-        return corners[y, :-1], corners[y, 1:], centres[y + 1, 1:], centres[y, 1:]
-    return corners[y, :-1], corners[y + 1, :-1], centres[y + 1, 1:], centres[y + 1, :-1]
+def _restore_row(a: U8, b: U8, c: U8, d: U8, residual: U8, offset: np.uint8, row: U8) -> None:
+    """Pixels from their four neighbours: the mean of the middle two, rounded up, plus what it missed."""
+    for x in range(row.size):
+        low = max(min(a[x], b[x]), min(c[x], d[x]))
+        high = min(max(a[x], b[x]), max(c[x], d[x]))
+        mean = np.uint8((low | high) - ((low ^ high) >> _ONE))  # the sum would need a ninth bit
+        row[x] = np.uint8(mean + residual[x] + offset)
 
 
 @_inlined
-def _predict_row(rows: Rows, prediction: I16, context: U8) -> None:
-    a, b, c, d = rows
-    for x in range(a.size):
-        low_ab, high_ab = min(a[x], b[x]), max(a[x], b[x])
-        low_cd, high_cd = min(c[x], d[x]), max(c[x], d[x])
-        prediction[x] = (max(low_ab, low_cd) + min(high_ab, high_cd) + 1) >> 1
-        spread = max(high_ab, high_cd) - min(low_ab, low_cd)
-        context[x] = (spread >= _LIMIT_1) + (spread >= _LIMIT_2) + (spread >= _LIMIT_3)
+def _interleave(even: U8, odd: U8, row: U8) -> None:
+    for x in range(odd.size):
+        row[2 * x] = even[x]
+        row[2 * x + 1] = odd[x]
 
 
 @_inlined
-def _take_residuals(context: U8, symbols: U8, cursors: I64, residual: U8) -> None:
-    """A row's residuals, each from the stream of its context; advances `cursors`.
+def _copy_row(source: U8, row: U8) -> None:
+    for x in range(row.size):
+        row[x] = source[x]
 
-    What the row takes from the four streams is counted in one register, 16 bits each: through memory
-    every pixel would wait some cycles for the count of the one before.
+
+@_inlined
+def _repeat_edges(plane: U8) -> None:
+    """Fill the last row and column with those before them."""
+    height, width = plane.shape[0] - 1, plane.shape[1] - 1
+    for y in range(height):
+        plane[y, width] = plane[y, width - 1]
+    _copy_row(plane[height - 1], plane[height])
+
+
+@_inlined
+def _refine(corners: U8, at_centres: U8, at_columns: U8, at_rows: U8, offset: np.uint8, finer: U8) -> None:
+    """Fill a grid from every second pixel (H + 1, W + 1; edges repeated) and the residuals of the others.
+
+    `offset` is added to the pixels between two corners.
     """
-    last, sixteen, low = symbols.size - 1, np.uint64(16), np.uint64(0xFFFF)
-    taken = np.uint64(0)
-    for x in range(context.size):
-        shift = np.uint64(context[x]) * sixteen
-        cursor = cursors[context[x]] + np.int64((taken >> shift) & low)
-        residual[x] = symbols[min(cursor, last)]
-        taken += np.uint64(1) << shift
-    for stream in range(cursors.size):
-        cursors[stream] += np.int64((taken >> (np.uint64(stream) * sixteen)) & low)
-
-
-@_inlined
-def _add_residuals(prediction: I16, residual: U8, reference: I16) -> None:
-    """Turn a row's predictions into its differences to `reference`; their sum with it is 0–255."""
-    for x in range(residual.size):
-        prediction[x] = ((prediction[x] + residual[x] + reference[x]) & 255) - reference[x]
-
-
-@_inlined
-def _frame_corners(plane: I16 | U8, stride: int, corners: I16) -> None:
-    """Every stride-th pixel, with the last row and column repeated."""
     height, width = corners.shape[0] - 1, corners.shape[1] - 1
+    above, centres = np.empty(width + 1, np.uint8), np.empty(width + 1, np.uint8)  # the first is repeated
+    between = np.empty(width, np.uint8)
+    for y in range(height):
+        left, right = corners[y, :-1], corners[y, 1:]
+        under_left, under_right = corners[y + 1, :-1], corners[y + 1, 1:]
+        _restore_row(left, right, under_left, under_right, at_centres[y], _ZERO, centres[1:])
+        centres[0] = centres[1]
+        if y == 0:
+            _copy_row(centres, above)
+        _restore_row(left, right, centres[1:], above[1:], at_columns[y], offset, between)
+        _interleave(left, between, finer[2 * y])
+        _restore_row(left, under_left, centres[1:], centres[:-1], at_rows[y], offset, between)
+        _interleave(between, centres[1:], finer[2 * y + 1])
+        above, centres = centres, above
+
+
+@_inlined
+def _restore_coarsest(residuals: U8, height: int, width: int) -> U8:
+    """Each pixel from the one before."""
+    plane = np.empty((height + 1, width + 1), np.uint8)
+    value = _ZERO
     for y in range(height):
         for x in range(width):
-            corners[y, x] = plane[stride * y, stride * x]
-        corners[y, width] = corners[y, width - 1]
-    for x in range(width + 1):
-        corners[height, x] = corners[height - 1, x]
+            value = np.uint8(value + residuals[y * width + x])
+            plane[y, x] = value
+    _repeat_edges(plane)
+    return plane
 
 
 @_inlined
-def _frame_centres(row: I16, y: int, centres: I16) -> None:
-    """Put a row of centres in its place, with the first row and column repeated."""
-    for x in range(row.size):
-        centres[y + 1, x + 1] = row[x]
-    centres[y + 1, 0] = row[0]
-    if y == 0:
-        for x in range(row.size + 1):
-            centres[0, x] = centres[1, x]
+def _restore_plane(residuals: U8, height: int, width: int) -> U8:
+    """A plane of whole blocks, with its last row and column repeated (H + 1, W + 1)."""
+    height, width = height >> _LEVELS, width >> _LEVELS
+    plane = _restore_coarsest(residuals, height, width)
+    for _ in range(_LEVELS):
+        size = height * width
+        steps = residuals[size : 4 * size].reshape(3, height, width)
+        height, width = 2 * height, 2 * width
+        finer = np.empty((height + 1, width + 1), np.uint8)
+        _refine(plane, steps[0], steps[1], steps[2], _ZERO, finer)
+        _repeat_edges(finer)
+        plane = finer
+    return plane
 
 
-@_inlined
-def _restore_coarsest(plane: I16, stride: int, reference: I16, symbols: U8, cursors: I64) -> None:
-    """Each pixel from the one before; the residuals are in the last context."""
-    last = symbols.size - 1
-    previous = 0
-    for y in range(0, plane.shape[0], stride):
-        for x in range(0, plane.shape[1], stride):
-            value = (previous + symbols[min(cursors[-1], last)] + reference[y, x]) & 255
-            cursors[-1] += 1
-            previous = value - reference[y, x]
-            plane[y, x] = previous
+@_compiled(void(_STREAM_IMAGE, uint8[:, :, ::1]))
+def restore_planes(residuals: U8, planes: U8) -> None:
+    """Fill planes (N, H, W) of whole blocks from their residuals (N, H·W)."""
+    for index in range(len(planes)):
+        plane = _restore_plane(residuals[index], planes.shape[1], planes.shape[2])
+        for y in range(planes.shape[1]):
+            _copy_row(plane[y], planes[index, y])
 
 
-@_compiled(void(_I16_IMAGE, _STREAM, int64[::1], uint8[:, :]))
-def restore_plane(reference: I16, symbols: U8, cursors: I64, pixels: U8) -> None:
-    """Fill `pixels`, coded as differences to `reference`, of whole blocks; advances `cursors`."""
-    stride = 1 << LEVELS
-    rows, columns = reference.shape
-    plane = np.empty((rows, columns), np.int16)
-    _restore_coarsest(plane, stride, reference, symbols, cursors)
-    while stride > 1:
-        height, width, half = rows // stride, columns // stride, stride // 2
-        corners = np.empty((height + 1, width + 1), np.int16)
-        centres = np.empty((height + 1, width + 1), np.int16)
-        row, under = np.empty(width, np.int16), np.empty(width, np.int16)
-        context, residual = np.empty(width, np.uint8), np.empty(width, np.uint8)
-        _frame_corners(plane, stride, corners)
-        for band in range(3):
-            down = 0 if band == _COLUMNS else half
-            right = 0 if band == _ROWS else half
-            for y in range(height):
-                for x in range(width):
-                    under[x] = reference[stride * y + down, stride * x + right]
-                _predict_row(_neighbour_rows(band, corners, centres, y), row, context)
-                _take_residuals(context, symbols, cursors, residual)
-                _add_residuals(row, residual, under)
-                if band == _CENTRES:
-                    _frame_centres(row, y, centres)
-                for x in range(width):
-                    plane[stride * y + down, stride * x + right] = row[x]
-        stride = half
-    for y in range(rows):
-        for x in range(columns):
-            pixels[y, x] = plane[y, x] + reference[y, x]
+@_compiled(void(_STREAM, uint8[:, ::1]))
+def restore_mosaic(residuals: U8, mosaic: U8) -> None:
+    """Fill a mosaic of whole blocks (H, W) from its residuals (H·W).
 
-
-@_compiled(int16[:, :, ::1](uint8[:, ::1], _STREAM, int64[::1]))
-def restore_greens(mosaic: U8, symbols: U8, cursors: I64) -> I16:
-    """Fill a mosaic's green pixels in odd rows from those in even ones; advances `cursors`.
-
-    Returns green where red and where blue is (2, H/2, W/2).
+    It is one more level: green in even rows is the coarser plane, and what a prediction of green misses
+    at red and at blue are planes themselves. Adding the 128 that they are stored with takes it away,
+    modulo 256.
     """
     height, width = mosaic.shape[0] // 2, mosaic.shape[1] // 2
-    corners = np.empty((height + 1, width + 1), np.int16)
-    centres = np.empty((height + 1, width + 1), np.int16)
-    row, zeros = np.empty(width, np.int16), np.zeros(width, np.int16)
-    context, residual = np.empty(width, np.uint8), np.empty(width, np.uint8)
-    greens = np.empty((2, height, width), np.int16)
-    _frame_corners(mosaic, 2, corners)
-    for y in range(height):
-        _predict_row(_neighbour_rows(_CENTRES, corners, centres, y), row, context)
-        _take_residuals(context, symbols, cursors, residual)
-        _add_residuals(row, residual, zeros)
-        _frame_centres(row, y, centres)
-        for x in range(width):
-            mosaic[2 * y + 1, 2 * x + 1] = row[x]
-        _predict_row(_neighbour_rows(_COLUMNS, corners, centres, y), greens[0, y], context)
-        _predict_row(_neighbour_rows(_ROWS, corners, centres, y), greens[1, y], context)
-    return greens
+    size = height * width
+    green = _restore_plane(residuals[:size], height, width)
+    red = _restore_plane(residuals[size : 2 * size], height, width)
+    blue = _restore_plane(residuals[2 * size : 3 * size], height, width)
+    centres = residuals[3 * size :].reshape(height, width)
+    _refine(green, centres, red, blue, _MIDDLE, mosaic)
 
 
 @_inlined
-def _unpack_codes(codes: U8, shift: int, residual: U16) -> None:
-    """Residuals 0, −1, 1 of the codes 0, 1, 2; −2 where code 3 announces an escape."""
-    for x in range(residual.size):
-        code = (codes[x] >> shift) & 3
-        residual[x] = (code >> 1) ^ -(code & 1)
+def _unpack_codes(codes: U8, steps: U64, escaped: U8) -> None:
+    """Steps 0, −1, 1 of the codes 0, 1, 2, four 16-bit ones in a word; code 3 gives 0 and a set bit."""
+    four = np.uint64(0x0001_0001_0001_0001)
+    for x in range(codes.size):
+        escaped[x] = codes[x] & (codes[x] >> _ONE) & np.uint8(0b01010101)
+        word = np.uint64(codes[x])
+        word = (word | (word << np.uint64(28))) & np.uint64(0x0000_000F_0000_000F)
+        word = (word | (word << np.uint64(14))) & np.uint64(0x0003_0003_0003_0003)
+        low, high = word & four, (word >> np.uint64(1)) & four
+        minus_one = low & ~high
+        steps[x] = (high & ~low) | ((minus_one << np.uint64(16)) - minus_one)
 
 
 @_inlined
-def _insert_escapes(residual: U16, escapes: U8, used: int) -> int:
-    """Put escaped residuals in their places; returns how many escapes the surface has asked for."""
-    for x in range(residual.size):
-        if residual[x] == _ESCAPED:
-            if used < escapes.shape[1]:
-                zigzag = escapes[0, used] + 256 * escapes[1, used] + 3
-                residual[x] = (zigzag >> 1) ^ -(zigzag & 1)
+def _unpack_escapes(escapes: U8) -> U16:
+    """Steps of zigzag − 3 in low bytes, high bytes."""
+    steps = np.empty(escapes.shape[1], np.uint16)
+    for x in range(steps.size):
+        zigzag = np.uint16(escapes[0, x] + 256 * escapes[1, x] + 3)
+        steps[x] = np.uint16((zigzag >> 1) ^ -(zigzag & 1))
+    return steps
+
+
+@_inlined
+def _insert_escapes(escaped: U8, escapes: U16, used: int, steps: U16) -> int:
+    """Put escaped steps in their places; returns how many escapes the surface has asked for.
+
+    One step in thirty is escaped: most words of 32 pixels are zero.
+    """
+    words = escaped.view(np.uint64)
+    for index in range(words.size):
+        word = words[index]
+        while word != np.uint64(0):
+            lowest_bit = word & (~word + np.uint64(1))
+            word ^= lowest_bit
+            if used < escapes.size:
+                steps[32 * index + _PIXEL_OF_BIT[(lowest_bit * _DE_BRUIJN) >> np.uint64(58)]] = escapes[used]
             used += 1
     return used
 
 
 @_inlined
-def _sum_row(mask: U8, residual: U16, start: int, none: int, valid: U8, row: U16) -> int:
-    """Add up one row; returns its first valid value, at which the next row starts."""
-    value = start
+def _add_row(steps: U16, mask: U8, bit: np.uint8, none: np.uint16, last: U16, row: U16) -> np.uint16:
+    """Each column's next value where there is a measurement, and the largest; `last` are those before."""
+    largest = np.uint16(0)
     for x in range(row.size):
-        value += residual[x]
-        residual[x] = value
-    for byte in range(mask.size):
-        for bit in range(8):
-            valid[8 * byte + bit] = (mask[byte] >> bit) & 1
-    for x in range(row.size):
-        row[x] = residual[x] if valid[x] else none
-    for x in range(row.size):
-        if valid[x]:
-            return int(row[x])
-    return start
+        last[x] = np.uint16(last[x] + steps[x])
+        row[x] = last[x] if mask[x] & bit else none
+        largest = max(largest, row[x])
+    return largest
 
 
-@_compiled(int64(_STREAM_IMAGE, _STREAM_IMAGE, _STREAM_IMAGE, uint16, uint16[:, ::1]))
-def restore_surface(mask: U8, codes: U8, escapes: U8, none: int, surface: U16) -> int:
+@_compiled(_COUNTS(_STREAM_IMAGE, _STREAM_IMAGE, _STREAM_IMAGE, uint16, uint16[:, ::1]))
+def restore_surface(mask: U8, codes: U8, escapes: U8, none: np.uint16, surface: U16) -> tuple[int, int]:
     """Fill `surface` from its mask, 2-bit codes and escapes (low bytes, high bytes).
 
-    Returns how many escapes the codes ask for, which the caller compares with how many there are.
+    Returns how many escapes the codes ask for, which the caller compares with how many there are, and the
+    largest value.
     """
-    residual, valid = np.empty(surface.shape[1], np.uint16), np.empty(8 * mask.shape[1], np.uint8)
-    used, start = 0, 0
-    for y in range(surface.shape[0]):
-        _unpack_codes(codes[y // 4], 2 * (y % 4), residual)
-        used = _insert_escapes(residual, escapes, used)
-        start = _sum_row(mask[y], residual, start, none, valid, surface[y])
-    return used
+    height, width = surface.shape
+    stride = codes.shape[1]
+    words, escaped = np.zeros(_BAND * stride, np.uint64), np.zeros(_BAND * stride, np.uint8)
+    steps = words.view(np.uint16)
+    last = np.zeros(width, np.uint16)
+    jumps = _unpack_escapes(escapes)
+    used, largest = 0, np.uint16(0)
+    for top in range(0, height, _BAND):
+        rows = min(_BAND, height - top)
+        if rows < _BAND:
+            escaped.fill(0)
+        band = codes[top : top + rows].reshape(rows * stride)
+        _unpack_codes(band, words, escaped)
+        used = _insert_escapes(escaped, jumps, used, steps)
+        for y in range(rows):
+            row_steps, bit = steps[4 * stride * y :], np.uint8(1 << y)
+            in_row = _add_row(row_steps, mask[top // _BAND], bit, none, last, surface[top + y])
+            largest = max(largest, in_row)
+    return used, int(largest)

@@ -16,7 +16,6 @@ from rig_protocol.errors import DataError
 from rig_protocol.frames import RgbdFrame
 
 DESCRIPTION = SourceDescription("A1", "1-1", CameraModel(), 30.0, "bayer", "raw")
-INTERVAL_NS = 33_333_333
 Step = RgbdFrame | Exception
 
 
@@ -68,7 +67,11 @@ class Recorder:
 
 
 def frames(*sequences: int) -> list[Step]:
-    return [RgbdFrame(0, sequence, sequence * INTERVAL_NS) for sequence in sequences]
+    return [RgbdFrame(0, sequence, time_of(sequence)) for sequence in sequences]
+
+
+def time_of(sequence: int) -> int:
+    return -(-sequence * 10**9 // 30)
 
 
 @pytest.fixture(autouse=True)
@@ -176,7 +179,7 @@ def test_damaged_frames_are_counted_and_passed_on(start: Start) -> None:
 )
 def test_a_faster_source_is_thinned_evenly(start: Start, max_fps: float | None, kept: range) -> None:
     _, recorder = start(frames(*range(12)), max_fps=max_fps)
-    assert [frame.timestamp_ns for frame in recorder.take(len(kept))] == [INTERVAL_NS * n for n in kept]
+    assert [frame.timestamp_ns for frame in recorder.take(len(kept))] == [time_of(n) for n in kept]
 
 
 def test_frames_left_out_on_purpose_leave_no_gap_and_lost_ones_do(start: Start) -> None:
@@ -187,7 +190,7 @@ def test_frames_left_out_on_purpose_leave_no_gap_and_lost_ones_do(start: Start) 
 
 def test_thinning_to_an_odd_rate_keeps_it_on_average(start: Start) -> None:
     capture, recorder = start(frames(*range(300), 10**6), max_fps=20.0)
-    assert recorder.take(201)[-1].timestamp_ns == 10**6 * INTERVAL_NS
+    assert recorder.take(201)[-1].timestamp_ns == time_of(10**6)
     assert capture.counters.captured == 201
 
 
@@ -211,12 +214,26 @@ def test_the_slower_of_what_the_operator_and_what_the_server_wants_counts(
         recorder.frames.put,
         recorder.failures.put,
     )
-    capture.wanted_fps = wanted_fps
+    capture.want(wanted_fps, 0)
     capture.start()
     taken = recorder.take(len(kept))
     assert capture.stop(5.0)
-    assert [frame.timestamp_ns for frame in taken] == [INTERVAL_NS * n for n in kept]
+    assert [frame.timestamp_ns for frame in taken] == [time_of(n) for n in kept]
     assert [frame.sequence for frame in taken] == list(range(len(kept)))
+
+
+@pytest.mark.parametrize("offset_ns", [0, 10**15, -(10**15), 33_333_334])
+def test_cameras_with_different_clocks_leave_out_the_same_moments(offset_ns: int) -> None:
+    """Their clocks are off by `offset_ns`; of two frames 33 ms apart, the one at even thirtieths counts."""
+    recorder = Recorder()
+    shown: list[Step] = [RgbdFrame(0, n, time_of(n) - offset_ns) for n in range(12)]
+    source = ScriptedSource(shown)
+    capture = Capture(lambda: source, None, recorder.count_opened, recorder.frames.put, recorder.failures.put)
+    capture.want(15.0, offset_ns)
+    capture.start()
+    taken = [frame.timestamp_ns + offset_ns for frame in recorder.take(6)]
+    assert capture.stop(5.0)
+    assert taken == [time_of(n) for n in range(0, 12, 2)]
 
 
 def test_what_the_server_wants_may_change_amid_the_stream() -> None:
@@ -226,7 +243,7 @@ def test_what_the_server_wants_may_change_amid_the_stream() -> None:
         def read(self, timeout_s: float) -> RgbdFrame | None:
             frame = super().read(timeout_s)
             if frame is not None and frame.sequence % 30 == 0:
-                capture.wanted_fps = {0: None, 30: 15.0, 60: 30.0}[frame.sequence]
+                capture.want({0: None, 30: 15.0, 60: 30.0}[frame.sequence], 0)
             return frame
 
     recorder = Recorder()
@@ -238,7 +255,7 @@ def test_what_the_server_wants_may_change_amid_the_stream() -> None:
         recorder.failures.put,
     )
     capture.start()
-    taken = [round(frame.timestamp_ns / INTERVAL_NS) for frame in recorder.take(75)]
+    taken = [frame.timestamp_ns * 30 // 10**9 for frame in recorder.take(75)]
     assert capture.stop(5.0)
     assert taken == [*range(30), *range(30, 60, 2), *range(60, 90)]
 

@@ -23,15 +23,15 @@ def color_names(image: ColorImage, wanted: Manner) -> list[str]:
 @pytest.mark.parametrize(
     ("image", "wanted", "names"),
     [
-        ("bayer", "lossless", ["bayer-lossless", "bayer-uncompressed"]),
-        ("bayer", "raw", ["bayer-uncompressed", "bayer-lossless"]),
+        ("bayer", "lossless", ["bayer-lossless", "bayer-uncompressed", "bgr-jpeg"]),
+        ("bayer", "raw", ["bayer-uncompressed", "bayer-lossless", "bgr-jpeg"]),
         ("bayer", "jpeg", ["bgr-jpeg", "bayer-lossless", "bayer-uncompressed"]),
         ("bgr", "jpeg", ["bgr-jpeg", "bgr-lossless", "bgr-uncompressed"]),
         ("grey", "jpeg", ["grey-jpeg", "grey-lossless", "grey-uncompressed"]),
-        ("grey", "lossless", ["grey-lossless", "grey-uncompressed"]),
+        ("grey", "lossless", ["grey-lossless", "grey-uncompressed", "grey-jpeg"]),
     ],
 )
-def test_the_wanted_manner_comes_first_and_lossy_only_when_wanted(
+def test_the_wanted_manner_comes_first_and_lossy_last_unless_wanted(
     image: ColorImage, wanted: Manner, names: list[str]
 ) -> None:
     assert color_names(image, wanted) == names

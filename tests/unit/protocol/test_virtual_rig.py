@@ -120,12 +120,13 @@ def finished(network: VirtualNetwork) -> Counter[str]:
     ids=str,
 )
 def test_a_network_that_loses_one_datagram_of_a_hundred_loses_no_frame(faults: Faults) -> None:
-    """Requests, answers, hellos and clocks are lost at the same rate."""
+    """Requests, answers, hellos and clocks are lost at the same rate; a first frame may precede the clock."""
     network = make_rig(faults)
     network.run(3.0)
     total = finished(network)
     assert total["sent"] > 12 * (3 * FPS - 2)
-    assert (total["frames"], total["lost"]) == (total["sent"], 0)
+    assert total["frames"] + total["untimed"] == total["sent"]
+    assert total["lost"] == total["untimed"] <= 2
 
 
 def test_a_network_that_loses_five_of_a_hundred_loses_less_than_one_frame_of_a_thousand() -> None:
@@ -393,14 +394,15 @@ def test_bursts_of_agents_with_different_clocks_take_turns_in_rig_time() -> None
     network.run(1.0)
     assert network.server is not None
     for slot in range(4):
-        network.server.plan_stream(slot, StreamChoice(COLOR, DEPTH, FPS, 1_000_000, slot, 4))
+        network.server.plan_stream(slot, StreamChoice(COLOR, DEPTH, FPS, slot, 4, 1_000_000, 0.8))
     network.run(1.0)
     for slot, agent in enumerate(network.agents):
         plan = agent.link.plan
         assert plan is not None
         # A moment of the plan's grid soon, by this agent's own clock, in true (which is rig) time:
         agent_ns = agent.clock.read(network.now_ns)
-        moment_ns = agent.clock.true_time(agent_ns + (plan.phase_ns - agent_ns) % plan.step_ns)
+        wait_ns = (plan.phase_ns - plan.offset_ns - agent_ns) % plan.step_ns
+        moment_ns = agent.clock.true_time(agent_ns + wait_ns)
         late_ns = (moment_ns - slot * 250_000 + 500_000) % 1_000_000 - 500_000
         assert abs(late_ns) < 50_000  # a fifth of a slot
 
@@ -421,7 +423,7 @@ def test_a_change_of_codec_amid_the_stream_loses_no_frame(first_codec: int) -> N
     assert network.server is not None
     for codec_id in (*codecs, *codecs):
         network.run(1.0)
-        network.server.plan_stream(0, StreamChoice(codec_id, DEPTH, FPS, 1_000_000, 0, 1))
+        network.server.plan_stream(0, StreamChoice(codec_id, DEPTH, FPS, 0, 1, 1_000_000, 0.8))
     network.run(1.0)
     frames = frames_of(network)[0]
     assert [frame.sequence for frame in frames] == list(

@@ -1,5 +1,6 @@
 """The command line of rig-server: what it writes, what it refuses, how it ends."""
 
+import json
 import os
 import signal
 import socket
@@ -83,7 +84,7 @@ def test_an_insecure_server_says_so_loudly(
 def test_help_teaches_with_examples(rig_server: Program, capsys: pytest.CaptureFixture[str]) -> None:
     assert rig_server("--help") == 0
     shown = capsys.readouterr().out
-    for word in ("--calibrate", "--simulate", "--out", "init", "Examples", "Exit status"):
+    for word in ("--calibrate", "--simulate", "--out", "init", "budget", "Examples", "Exit status"):
         assert word in shown
 
 
@@ -126,6 +127,29 @@ def test_cameras_that_do_not_come_end_the_calibration_with_status_1_and_their_na
     (tmp_path / "rig.toml").write_text(f"listen = '127.0.0.1:0'\n[capture]\nwait_s = 0.5\n{cameras}")
     assert rig_server("--calibrate", "--insecure") == 1
     assert "2 of 2 cameras have not come: door, cam01" in capsys.readouterr().err
+
+
+def test_budget_goes_by_the_cameras_of_rig_toml_and_says_what_it_chose(
+    rig_server: Program, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    (tmp_path / "rig.toml").write_text("expected_cameras = 8\n[link]\nmtu = 9000\n")
+    assert rig_server("budget", "--json", "--link-mbit", "300") == 0
+    told = json.loads(capsys.readouterr().out)
+    assert (told["cameras"], told["link"]["mtu"], told["link"]["speed_mbit"]) == (8, 9000, 300)
+    assert [one["chosen"] for one in told["configurations"]] == [False, False, False, True]
+    assert told["chosen_fps"] == 30.0
+    assert told["pacing"]["backlog_bytes"] <= 128 * 1024
+    assert rig_server("budget") == 0
+    assert "8 cameras at 30 fps" in capsys.readouterr().out
+
+
+def test_budget_ends_with_status_1_when_nothing_fits_and_2_for_a_link_that_cannot_be(
+    rig_server: Program, capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert rig_server("budget", "--link-mbit", "2") == 1
+    assert "use fewer cameras" in capsys.readouterr().out.replace("\n", " ")
+    assert rig_server("budget", "--link-mbit", "0") == 2
+    assert "link.speed_mbit" in capsys.readouterr().err
 
 
 def test_a_running_server_ends_with_status_0_when_told_to_stop(tmp_path: Path) -> None:

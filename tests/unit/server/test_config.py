@@ -89,7 +89,11 @@ def test_rig_toml_of_the_working_directory_is_found(written: Path, monkeypatch: 
         ("[[cameras]]\nname = 'cam01'", "cameras.0.id"),
         ("expected_cameras = 3\n[[cameras]]\nid = 0", "expected_cameras is 3, 1 are listed"),
         ("[capture]\nframes = 0", "capture.frames"),
+        ("[link]\nusable = 1.5", "link.usable"),
+        ("[link]\nspeed = 100", "did you mean `speed_mbit`"),
         ("[synchroniser]\ndeadline_ms = -5", "synchroniser.deadline_ms"),
+        ("metrics = ':9100'", "for all interfaces write 0.0.0.0:PORT"),
+        ("metrics = 99999", "a port from 0 to 65535"),
         ("listen = ", "is not valid TOML"),
     ],
 )
@@ -108,6 +112,23 @@ def test_a_wrong_setting_is_refused_by_name(tmp_path: Path, text: str, told: str
 )
 def test_an_address_may_leave_out_host_or_port(text: str, address: tuple[str, int]) -> None:
     assert parse_address(text) == address
+
+
+@pytest.mark.parametrize(
+    ("text", "address"),
+    [
+        ("metrics = 9100", ("127.0.0.1", 9100)),
+        ("metrics = '9100'", ("127.0.0.1", 9100)),
+        ("metrics = '10.0.0.1:9100'", ("10.0.0.1", 9100)),
+        ("metrics = '[::1]:9100'", ("::1", 9100)),
+        ("", None),
+    ],
+)
+def test_metrics_are_for_this_machine_unless_a_host_is_named(
+    tmp_path: Path, text: str, address: tuple[str, int] | None
+) -> None:
+    (tmp_path / "rig.toml").write_text(text)
+    assert load_rig_settings(tmp_path / "rig.toml").metrics_address == address
 
 
 def test_the_commented_file_changes_nothing_and_the_effective_one_says_the_same(

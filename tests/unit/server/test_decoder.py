@@ -81,6 +81,25 @@ def test_a_frame_comes_back_as_it_was(frame: RgbdFrame, color: int, depth: int) 
         np.testing.assert_array_equal(getattr(decoded, field), getattr(frame, field), strict=True)
 
 
+@pytest.mark.parametrize("shape", [(48, 64), (1, 1), (3, 2)])
+def test_demosaicing_adds_colour_beside_the_mosaic_and_changes_nothing_else(shape: tuple[int, int]) -> None:
+    frame = RgbdFrame(1, 2, 3, bayer=np.full(shape, 9, np.uint8), raw=scene("raw", *shape))
+    plain, demosaiced = (decode_frame(encode_frame(frame, BAYER, RAW), wanted) for wanted in (False, True))
+    assert plain.color is None
+    assert demosaiced.color is not None
+    assert demosaiced.color.shape == (*shape, 3)
+    assert shape != (48, 64) or (demosaiced.color == 9).all()
+    for field in set(RgbdFrame.__slots__) - {"color"}:
+        np.testing.assert_array_equal(getattr(demosaiced, field), getattr(plain, field), strict=True)
+
+
+def test_demosaicing_leaves_frames_that_have_colour_alone() -> None:
+    frame = RgbdFrame(1, 2, 3, color=scene("bgr", 48, 64))
+    np.testing.assert_array_equal(
+        decode_frame(encode_frame(frame, 2, None), demosaic=True).color, frame.color
+    )
+
+
 def test_a_codec_of_the_other_stream_is_a_data_error() -> None:
     payload = encoded(0, 0).depth
     with pytest.raises(DataError, match="none of this stream's"):

@@ -11,6 +11,8 @@ from rig_protocol.events import Address
 from rig_protocol.frames import PanoramicFrame
 from rig_server import Rig
 from rig_server.config import CameraSettings, RigSettings, SynchroniserSettings
+from rig_server.durations import RECEIVED_TO_DELIVERED, SPREAD, STAGES, UNCERTAINTY
+from rig_server.exposition import DROPPED
 from support.garbage import send_garbage
 from support.small_agent import BAYER, FPS, RAW, SmallAgent
 
@@ -69,12 +71,19 @@ def test_the_status_tells_rates_clock_error_and_temperature(rig: Rig) -> None:
         status = rig.status()
     assert status.connected == 3
     assert status.complete >= 30
+    sets = status.complete + status.partial
+    for name in (RECEIVED_TO_DELIVERED, SPREAD, UNCERTAINTY):
+        assert abs(status.durations[name].count - sets) <= 2  # the rig does not stand still while it is read
+    assert all(status.recent[stage].quantile_ns(0.5) is not None for stage in STAGES)
+    assert status.queues.keys() == {"decoder", "synchroniser", "sets"}
     assert status.spread_ms is not None
     for camera in status.cameras:
         assert FPS / 5 < camera.fps < 1.4 * FPS  # a busy machine costs these agents frames
         assert camera.clock_error_us is not None
         assert camera.clock_error_us < 20_000
         assert camera.temperature_c == 50.0 + camera.camera_id
+        assert camera.counters["frames"] == camera.frames
+        assert camera.clock is not None
 
 
 def test_the_description_holds_names_and_models_of_the_hellos(rig: Rig) -> None:
@@ -102,13 +111,16 @@ def test_waiting_for_cameras_ends_at_once_when_receiving_has_failed(
 
 
 def test_everything_that_is_lost_on_the_way_has_a_name(rig: Rig) -> None:
-    assert rig.status().dropped == {
+    status = rig.status()
+    assert sum(status.rejected.values()) == 0
+    assert status.dropped.keys() == DROPPED.keys() | {"frames not decoded in time"}, "metrics must tell all"
+    assert status.dropped == {
+        "incomplete sets": 0,
         "sets not taken": 0,
         "frames left out of sets": 0,
         "frames of implausible time": 0,
         "frames not decoded in time": 0,
         "datagrams by the kernel": 0,
-        "datagrams of no camera": 0,
         "answers that the network refused": 0,
     }
 

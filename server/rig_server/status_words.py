@@ -1,0 +1,80 @@
+"""The rig's status in sentences: a few figures that always stand there, and a line for each trouble."""
+
+from collections.abc import Mapping
+
+from rig_server.durations import (
+    EXPOSURE_TO_RECEIVED,
+    RECEIVED_TO_DECODED,
+    RECEIVED_TO_DELIVERED,
+    UNCERTAINTY,
+)
+from rig_server.histogram import HistogramSnapshot
+from rig_server.metrics import RigStatus
+
+_STAGES = {
+    EXPOSURE_TO_RECEIVED: "arrival",
+    RECEIVED_TO_DECODED: "decoding",
+    RECEIVED_TO_DELIVERED: "delivery",
+}
+_MOST_CAUSES = 4  # that fit a line
+
+
+def summary(status: RigStatus) -> tuple[list[str], list[str]]:
+    """Lines of figures, and lines of troubles, of which a healthy rig has none."""
+    figures, latency = [_sets(status)], _latency(status.recent)
+    if latency:
+        figures.append(latency)
+    if status.link is not None:
+        figures.append(status.link)
+    names = {camera.camera_id: camera.name for camera in status.cameras}
+    missing = [names.get(camera_id, str(camera_id)) for camera_id in status.often_missing]
+    troubles = {
+        "often missing": ", ".join(missing),
+        "waiting": _waiting(status),
+        "dropped": _counts(status.dropped),
+        "rejected datagrams": _counts(status.rejected, _MOST_CAUSES),
+    }
+    return figures, [f"{what}: {which}" for what, which in troubles.items() if which]
+
+
+def _sets(status: RigStatus) -> str:
+    spread = "" if status.spread_ms is None else f", spread {status.spread_ms:.1f} ms"
+    uncertainty_ms = _quantile_ms(status.recent.get(UNCERTAINTY), 0.5)
+    error = "" if uncertainty_ms is None else f" ± {1000 * uncertainty_ms:.0f} µs"
+    counts = f"{status.complete} complete, {status.partial} partial"
+    return f"{status.sets_per_s:.1f} sets/s{spread}{error}, {counts}"
+
+
+def _latency(recent: Mapping[str, HistogramSnapshot]) -> str:
+    parts = []
+    for stage, words in _STAGES.items():
+        half, most = (_quantile_ms(recent.get(stage), share) for share in (0.5, 0.99))
+        if half is not None and most is not None:
+            parts.append(f"{words} {_short(half)}/{_short(most)}")
+    return f"p50/p99 ms: {', '.join(parts)}" if parts else ""
+
+
+def _short(duration_ms: float) -> str:
+    return f"{duration_ms:.1f}" if duration_ms < 10 else f"{duration_ms:.0f}"
+
+
+def _waiting(status: RigStatus) -> str:
+    """Frames wait in the synchroniser for one another by design: they are no trouble."""
+    queues = {name: length for name, length in status.queues.items() if name != "synchroniser"}
+    return _counts(queues | {"receive buffer MiB": status.unread_bytes >> 20})
+
+
+def _counts(counts: Mapping[str, int], most: int | None = None) -> str:
+    """What is not zero; the largest `most` of them, largest first, and how many more there are."""
+    shown = [(name, count) for name, count in counts.items() if count]
+    if most is not None:
+        shown.sort(key=lambda item: -item[1])
+    words = [f"{name.replace('_', ' ')} {count}" for name, count in shown[:most]]
+    if len(shown) > len(words):
+        words.append(f"{len(shown) - len(words)} more")
+    return ", ".join(words)
+
+
+def _quantile_ms(seen: HistogramSnapshot | None, share: float) -> float | None:
+    quantile_ns = None if seen is None else seen.quantile_ns(share)
+    return None if quantile_ns is None else quantile_ns / 1e6
