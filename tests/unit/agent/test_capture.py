@@ -1,14 +1,16 @@
 """Rules of capture: a lost source is opened again, frames count on, what cannot be cured is reported."""
 
 import logging
+import random
 import threading
 from collections.abc import Callable, Iterator, Mapping
+from itertools import pairwise
 from types import TracebackType
 from typing import Self
 
 import pytest
 
-from rig_agent.capture import Capture
+from rig_agent.capture import Capture, _Thinning
 from rig_agent.frame_queue import FrameQueue
 from rig_agent.sources.base import SourceDescription, SourceLost
 from rig_protocol.camera import CameraModel
@@ -186,9 +188,9 @@ def test_frames_left_out_on_purpose_leave_no_gap_and_lost_ones_do(start: Start) 
 
 
 def test_thinning_to_an_odd_rate_keeps_it_on_average(start: Start) -> None:
-    capture, recorder = start(frames(*range(300), 10**6), max_fps=20.0)
-    assert recorder.take(201)[-1].timestamp_ns == 10**6 * INTERVAL_NS
-    assert capture.counters.captured == 201
+    _, recorder = start(frames(*range(300), *range(10**6, 10**6 + 3)), max_fps=20.0)
+    taken = recorder.take(201)
+    assert taken[199].timestamp_ns < 300 * INTERVAL_NS < taken[200].timestamp_ns
 
 
 @pytest.mark.parametrize(
@@ -211,7 +213,7 @@ def test_the_slower_of_what_the_operator_and_what_the_server_wants_counts(
         recorder.frames.put,
         recorder.failures.put,
     )
-    capture.wanted_fps = wanted_fps
+    capture.want(wanted_fps, 0)
     capture.start()
     taken = recorder.take(len(kept))
     assert capture.stop(5.0)
@@ -226,7 +228,7 @@ def test_what_the_server_wants_may_change_amid_the_stream() -> None:
         def read(self, timeout_s: float) -> RgbdFrame | None:
             frame = super().read(timeout_s)
             if frame is not None and frame.sequence % 30 == 0:
-                capture.wanted_fps = {0: None, 30: 15.0, 60: 30.0}[frame.sequence]
+                capture.want({0: None, 30: 15.0, 60: 30.0}[frame.sequence], 0)
             return frame
 
     recorder = Recorder()
@@ -249,3 +251,27 @@ def test_a_full_queue_drops_the_oldest_and_counts_it() -> None:
         queue.put(item)
     assert queue.dropped == 3
     assert [queue.get(), queue.get(), queue.get()] == [3, 4, None]
+
+
+def test_agents_with_other_clocks_leave_out_the_same_moments_of_rig_time() -> None:
+    """Three agents whose clocks differ; their cameras run freely, within one period of each other."""
+    taken = []
+    for offset_ns, phase_ns in ((0, 0), (10**12 + 7, 9_000_000), (-(10**11) - 3, 21_000_000)):
+        stamps = [INTERVAL_NS * n + phase_ns - offset_ns for n in range(40)]
+        thinning = _Thinning()
+        kept = [stamp + offset_ns for stamp in stamps if thinning.accepts(stamp + offset_ns, 7.5, 30.0)]
+        taken.append(kept[1:9])
+    for moments in zip(*taken, strict=True):
+        assert max(moments) - min(moments) <= INTERVAL_NS
+
+
+@pytest.mark.parametrize("phase_ns", range(0, 66_000_000, 1_700_000))
+def test_a_camera_of_any_phase_is_thinned_evenly_whatever_its_jitter(phase_ns: int) -> None:
+    rng, thinning = random.Random(phase_ns), _Thinning()
+    kept = [
+        n
+        for n in range(60)
+        if thinning.accepts(INTERVAL_NS * n + phase_ns + rng.randint(-200_000, 200_000), 15.0, 30.0)
+    ]
+    assert [after - before for before, after in pairwise(kept)] == [2] * (len(kept) - 1)
+    assert len(kept) >= 29

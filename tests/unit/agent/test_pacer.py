@@ -162,7 +162,7 @@ def test_clearing_counts_what_was_unsent() -> None:
 # ---- the server's grid
 
 STEP_NS = 1_000_000
-GRID = BurstGrid(STEP_NS, 250_000)
+GRID = BurstGrid(STEP_NS, 250_000, 0.8)
 
 
 @pytest.mark.parametrize("now_ns", [0, 249_999, 250_000, 250_001, 10**15 + 3, -5])
@@ -189,7 +189,7 @@ def test_the_bursts_of_agents_in_other_slots_never_coincide() -> None:
     times = []
     for slot in range(12):
         pacer = make_pacer()
-        pacer.grid = BurstGrid(STEP_NS, slot * STEP_NS // 12)
+        pacer.grid = BurstGrid(STEP_NS, slot * STEP_NS // 12, 0.8)
         pacer.submit(frame(160), slot * 1_234_567)
         times += [time_ns for time_ns, _ in drain(pacer, slot * 1_234_567, 10**9)]
     assert min(after - before for before, after in pairwise(sorted(times))) >= STEP_NS // 13
@@ -205,7 +205,7 @@ def test_a_frame_of_many_datagrams_takes_larger_bursts_not_more_time() -> None:
 
 def test_a_step_longer_than_the_share_of_the_interval_sends_a_frame_in_one_burst() -> None:
     pacer = make_pacer()
-    pacer.grid = BurstGrid(100_000_000, 5)
+    pacer.grid = BurstGrid(100_000_000, 5, 0.8)
     pacer.submit(frame(20), 0)
     assert [len(burst) for _, burst in drain(pacer, 0, 10**9)] == [20 * SIZE]
 

@@ -52,6 +52,9 @@ class MemoryTransport:
     def send_datagram(self, data: bytes) -> None:
         self.sent.append(data)
 
+    def limit_rate(self, bytes_per_s: float) -> None:
+        self.rate = bytes_per_s
+
     def fileno(self) -> None:
         return None
 
@@ -141,7 +144,7 @@ def uplink(transport: MemoryTransport) -> Uplink:
     return uplink
 
 
-PLAN = StreamPlan(COLOR + 1, None, 15.0, 1_000_000, 250_000)
+PLAN = StreamPlan(COLOR + 1, None, 15.0, 1_000_000, 350_000, 0.8, offset_ns=7_000_100_000)
 
 
 def test_before_any_plan_the_first_codecs_of_the_welcome_are_wanted_at_full_rate(
@@ -159,7 +162,7 @@ def test_a_plan_says_what_is_wanted_and_the_next_one_replaces_it(
     for plan in (PLAN, replace(PLAN, color_codec=COLOR, depth_codec=DEPTH, fps=30.0)):
         transport.arrived.append(server.seal(plan))
         uplink.serve(0)
-        assert uplink.wanted == Wanted(4, plan.color_codec, plan.depth_codec, plan.fps)
+        assert uplink.wanted == Wanted(4, plan.color_codec, plan.depth_codec, plan.fps, plan.offset_ns)
 
 
 def test_frames_leave_on_the_grid_of_the_plan_and_in_its_interval(transport: MemoryTransport) -> None:

@@ -45,7 +45,7 @@ from support.wire import (
     roundtrip,
 )
 
-PLAN = StreamPlan(COLOR, None, 15.0, 1_000_000, 250_000)
+PLAN = StreamPlan(COLOR, None, 15.0, 1_000_000, 250_000, 0.8, -5)
 
 
 def the_hello(agent: AgentLink, now_ns: int = T0) -> bytes:

@@ -109,8 +109,9 @@ def test_the_runs_of_any_batch_are_its_bytes_in_order(size: int) -> None:
     assert sum(count for count, _ in runs) == len(DatagramBatch(content, size))
 
 
-def test_a_few_datagrams_are_runs_of_one() -> None:
-    assert [count for count, _ in consecutive_runs(batch_of(following(3)))] == [1, 1, 1]
+@pytest.mark.parametrize("count", range(1, 40))
+def test_a_run_is_found_whether_datagrams_are_few_or_many(count: int) -> None:
+    assert [run for run, _ in consecutive_runs(batch_of(following(count)))] == [count]
 
 
 def test_an_empty_batch_has_no_runs() -> None:

@@ -48,7 +48,7 @@ SIMPLE: list[Message] = [
     Heartbeat({}, 2**64 - 1),
     Resend(2**64 - 1, ((0, 1), (7, 3), (65535, 65535))),
     Resend(0, WHOLE_FRAME),
-    StreamPlan(2, None, 14.5, 1_000_000, 999_999),
+    StreamPlan(2, None, 14.5, 1_000_000, 999_999, 0.05, -(2**63)),
 ]
 
 
@@ -202,7 +202,15 @@ def test_a_welcome_out_of_range_is_malformed(values: dict[str, Any]) -> None:
         decode(MessageType.WELCOME, broken)
 
 
-PLAN: dict[str, Any] = {"color_codec": 2, "depth_codec": None, "fps": 30.0, "step_ns": 1000, "phase_ns": 999}
+PLAN: dict[str, Any] = {
+    "color_codec": 2,
+    "depth_codec": None,
+    "fps": 30.0,
+    "step_ns": 1000,
+    "phase_ns": 999,
+    "spread": 1.0,
+    "offset_ns": 2**63 - 1,
+}
 
 
 @pytest.mark.parametrize(
@@ -212,6 +220,8 @@ PLAN: dict[str, Any] = {"color_codec": 2, "depth_codec": None, "fps": 30.0, "ste
         *({"fps": fps} for fps in (0.0, math.nan, math.inf, 241.0, None)),
         *({"step_ns": step_ns} for step_ns in (0, -1, 1_000_000_001, 1.5)),
         *({"phase_ns": phase_ns} for phase_ns in (1000, -1, None)),
+        *({"spread": spread} for spread in (0.0, 1.01, math.nan, None)),
+        *({"offset_ns": offset_ns} for offset_ns in (2**63, 0.5, None)),
     ],
     ids=str,
 )

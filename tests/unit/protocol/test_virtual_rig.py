@@ -393,14 +393,14 @@ def test_bursts_of_agents_with_different_clocks_take_turns_in_rig_time() -> None
     network.run(1.0)
     assert network.server is not None
     for slot in range(4):
-        network.server.plan_stream(slot, StreamChoice(COLOR, DEPTH, FPS, 1_000_000, slot, 4))
+        network.server.plan_stream(slot, StreamChoice(COLOR, DEPTH, FPS, slot, 4, 1_000_000, 0.8))
     network.run(1.0)
     for slot, agent in enumerate(network.agents):
         plan = agent.link.plan
         assert plan is not None
         # A moment of the plan's grid soon, by this agent's own clock, in true (which is rig) time:
-        agent_ns = agent.clock.read(network.now_ns)
-        moment_ns = agent.clock.true_time(agent_ns + (plan.phase_ns - agent_ns) % plan.step_ns)
+        agent_ns, phase_ns = agent.clock.read(network.now_ns), plan.phase_ns - plan.offset_ns
+        moment_ns = agent.clock.true_time(agent_ns + (phase_ns - agent_ns) % plan.step_ns)
         late_ns = (moment_ns - slot * 250_000 + 500_000) % 1_000_000 - 500_000
         assert abs(late_ns) < 50_000  # a fifth of a slot
 
@@ -421,7 +421,7 @@ def test_a_change_of_codec_amid_the_stream_loses_no_frame(first_codec: int) -> N
     assert network.server is not None
     for codec_id in (*codecs, *codecs):
         network.run(1.0)
-        network.server.plan_stream(0, StreamChoice(codec_id, DEPTH, FPS, 1_000_000, 0, 1))
+        network.server.plan_stream(0, StreamChoice(codec_id, DEPTH, FPS, 0, 1, 1_000_000, 0.8))
     network.run(1.0)
     frames = frames_of(network)[0]
     assert [frame.sequence for frame in frames] == list(
