@@ -113,7 +113,7 @@ class Capture:
     def _is_wanted(self, thinning: "_Thinning", timestamp_ns: int, source_fps: float) -> bool:
         wanted_fps, rig_offset_ns = self._wanted
         max_fps = min(self._max_fps or source_fps, wanted_fps or source_fps)
-        return max_fps >= source_fps or thinning.accepts(timestamp_ns + rig_offset_ns, max_fps)
+        return max_fps >= source_fps or thinning.accepts(timestamp_ns + rig_offset_ns, max_fps, source_fps)
 
     def _deliver(self, frame: RgbdFrame) -> None:
         self._next_sequence = frame.sequence + 1
@@ -123,15 +123,25 @@ class Capture:
 
 
 class _Thinning:
-    """Lets the first frame of each interval pass: all cameras of a rig leave out the same moments."""
+    """Lets frames of a source pass at a lower rate, the same moments of rig time at all agents.
+
+    The first one is exposed in the first part of an interval of rig time that is one source period long; the
+    others follow evenly, each the nearest to its due time.
+    """
 
     def __init__(self) -> None:
-        self._interval: int | None = None
+        self._fps = 0.0
+        self._due_ns = 0.0
 
-    def accepts(self, rig_time_ns: int, max_fps: float) -> bool:
-        """True for the first frame exposed in an interval of 1/`max_fps` of rig time."""
-        interval = int(rig_time_ns * max_fps // 1_000_000_000)
-        if interval == self._interval:
+    def accepts(self, rig_time_ns: int, max_fps: float, source_fps: float) -> bool:
+        """True for a frame that is due at a rate of `max_fps`, below `source_fps`."""
+        interval_ns, source_ns = 1e9 / max_fps, 1e9 / source_fps
+        if max_fps != self._fps or abs(rig_time_ns - self._due_ns) > interval_ns:
+            # A quarter of a period on: frames at whole intervals must not depend on a microsecond.
+            if (rig_time_ns + source_ns / 4) % interval_ns >= source_ns:
+                return False
+            self._fps, self._due_ns = max_fps, rig_time_ns
+        if rig_time_ns < self._due_ns - source_ns / 2:
             return False
-        self._interval = interval
+        self._due_ns += interval_ns
         return True

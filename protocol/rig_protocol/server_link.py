@@ -232,7 +232,8 @@ class ServerLink:
             case Heartbeat():
                 session.receive_heartbeat(message, now_ns)
             case ClockReply():
-                session.receive_clock_reply(message, self.system_clock, now_ns)
+                for frame in session.receive_clock_reply(message, self.system_clock, now_ns):
+                    self._push(FrameReceived(frame))
             case Goodbye(text):
                 self._end(session, f"goodbye: {text}")
 

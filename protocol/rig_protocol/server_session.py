@@ -25,6 +25,8 @@ _FUTURE_MARGIN_NS = 1_000_000
 _FUTURE_UNCERTAINTIES = 4
 # No queue of an agent holds frames for so long: an older stamp is a wrong one.
 MAX_FRAME_AGE_NS = 10_000_000_000
+# Frames of a new session that overtake its first clock reply: 130 ms at 30 frames/s.
+_MAX_EARLY = 4
 
 
 @dataclass(slots=True)
@@ -66,6 +68,7 @@ class ServerSession:
             welcome.cipher, keys.server_control, keys.agent_control, welcome.session_id
         )
         self._clock = ClockSync(now_ns)
+        self._early: list[tuple[EncodedFrame, int]] = []  # with their arrival; before the clock is known
         self._reassembler = Reassembler(
             welcome.camera_id,
             status.hello.fps,
@@ -111,8 +114,11 @@ class ServerSession:
 
     def receive_clock_reply(
         self, reply: ClockReply, rig_system_clock: SystemClockReading | None, now_ns: int
-    ) -> None:
-        """Take a clock reply into the estimate, and what both machines say of their system clocks."""
+    ) -> list[EncodedFrame]:
+        """Take a clock reply into the estimate, and what both machines say of their system clocks.
+
+        The first one gives their time to frames that were quicker than it: those may be delivered now.
+        """
         counters, clock = self.status.counters, self._clock
         before = clock.steps, clock.system_clock_disagreements
         if clock.receive(reply, now_ns):
@@ -124,6 +130,9 @@ class ServerSession:
         counters.system_clock_disagreements += clock.system_clock_disagreements - before[1]
         self.status.clock = self._clock.estimate
         self.due_ns = min(self.due_ns, self._clock.next_request_ns)
+        early, self._early = self._early, []
+        delivered = (self._deliver(frame, received_ns, now_ns) for frame, received_ns in early)
+        return [frame for frame in delivered if frame is not None]
 
     def receive_heartbeat(self, heartbeat: Heartbeat, now_ns: int) -> None:
         """The agent's gauges, and how many frames it has sent."""
@@ -156,24 +165,34 @@ class ServerSession:
     def close(self) -> None:
         """The session is over: count what it leaves unfinished."""
         self._reassembler.close()
+        self.status.counters.untimed += len(self._early)
         self.status.connected = False
 
     def _accept(self, frame: EncodedFrame, now_ns: int) -> EncodedFrame | None:
-        counters = self.status.counters
         if not self.welcome.allows(frame):
-            counters.unexpected_codec += 1
+            self.status.counters.unexpected_codec += 1
             return None
-        stamped = self._stamp(frame, now_ns)
-        if stamped is None:
+        if self._clock.estimate is None and len(self._early) < _MAX_EARLY:
+            self._early.append((frame, now_ns))
+            return None
+        return self._deliver(frame, now_ns, now_ns)
+
+    def _deliver(self, frame: EncodedFrame, received_ns: int, now_ns: int) -> EncodedFrame | None:
+        """The frame in rig time; None (counted) where its time is not known or cannot be true."""
+        counters = self.status.counters
+        stamp = self._stamp(frame.timestamp_ns, now_ns)
+        if stamp is None:
             counters.untimed += 1
             return None
         counters.frames += 1
         counters.damaged += frame.damaged
-        return stamped
+        timestamp_ns, uncertainty_ns = stamp
+        total_ns = ceil(hypot(uncertainty_ns, frame.uncertainty_ns))
+        return replace(frame, timestamp_ns=timestamp_ns, uncertainty_ns=total_ns, received_ns=received_ns)
 
-    def _stamp(self, frame: EncodedFrame, now_ns: int) -> EncodedFrame | None:
-        """The frame in rig time; None where its time is not known or cannot be true."""
-        mapped = self._clock.to_rig(frame.timestamp_ns)
+    def _stamp(self, agent_time_ns: int, now_ns: int) -> tuple[int, int] | None:
+        """Rig time and its uncertainty; None where it is not known or cannot be true."""
+        mapped = self._clock.to_rig(agent_time_ns)
         if mapped is None:
             return None
         timestamp_ns, uncertainty_ns = mapped
@@ -182,8 +201,7 @@ class ServerSession:
             self._clock.hurry()
             self.due_ns = min(self.due_ns, self._clock.next_request_ns)
             return None
-        total_ns = ceil(hypot(uncertainty_ns, frame.uncertainty_ns))
-        return replace(frame, timestamp_ns=timestamp_ns, uncertainty_ns=total_ns, received_ns=now_ns)
+        return mapped
 
 
 def _plan(choice: StreamChoice, offset_ns: int) -> StreamPlan:

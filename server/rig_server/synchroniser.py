@@ -102,10 +102,11 @@ class Synchroniser:
 
     def add(self, frame: RgbdFrame, now_ns: int) -> None:
         """Take a frame stamped in rig time; what comes too late or is implausible is counted."""
-        if self._queues.is_ahead_of(now_ns + _MAX_AHEAD_NS):
+        queue = self._queues[frame.camera_id]
+        if self._queues.is_ahead_of(now_ns + _MAX_AHEAD_NS) or queue.closed_ns > now_ns + _MAX_AHEAD_NS:
             self._queues.begin_anew()
             self._policy = self._make_policy()
-        queue = self._queues[frame.camera_id]
+            queue = self._queues[frame.camera_id]
         if frame.timestamp_ns > now_ns + _MAX_AHEAD_NS or queue.holds(frame.timestamp_ns):
             self.counters.implausible += 1
             return

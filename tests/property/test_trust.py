@@ -80,7 +80,7 @@ def test_a_message_to_the_agent_of_which_any_bit_is_altered_is_not_read(cipher: 
     agent, server = make_agent(), ServerPeer()
     agent.receive_datagram(server.welcome(agent.datagrams_to_send(T0)[0], cipher=cipher), T0)
     agent.receive_datagram(server.seal(ClockRequest(1)), T0)
-    datagram = server.seal(StreamPlan(COLOR, None, 15.0, 1000, 5, 0.8, -7))
+    datagram = server.seal(StreamPlan(COLOR, None, 15.0, 1000, 5, 0.8, 0))
     for count, harmed in enumerate(alterations(datagram), start=1):
         agent.receive_datagram(harmed, T0)
         assert sum(agent.counters.rejected.values()) == count

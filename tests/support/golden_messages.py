@@ -62,7 +62,7 @@ FROM_SERVER: dict[str, Message] = {
     "clock request": ClockRequest(1_000_000_000),
     "resend": Resend(9, ((0, 1), (17, 3))),
     "resend of a whole frame": Resend(10, WHOLE_FRAME),
-    "plan": StreamPlan(3, None, 15.0, 1_000_000, 250_000, 0.75, -(2**40)),
+    "plan": StreamPlan(3, None, 15.0, 1_000_000, 250_000, 0.8, -123_456_789),
     "goodbye": Goodbye("the server stops"),
 }
 

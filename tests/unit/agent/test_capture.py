@@ -1,14 +1,16 @@
 """Rules of capture: a lost source is opened again, frames count on, what cannot be cured is reported."""
 
 import logging
+import random
 import threading
 from collections.abc import Callable, Iterator, Mapping
+from itertools import pairwise
 from types import TracebackType
 from typing import Self
 
 import pytest
 
-from rig_agent.capture import Capture
+from rig_agent.capture import Capture, _Thinning
 from rig_agent.frame_queue import FrameQueue
 from rig_agent.sources.base import SourceDescription, SourceLost
 from rig_protocol.camera import CameraModel
@@ -16,6 +18,7 @@ from rig_protocol.errors import DataError
 from rig_protocol.frames import RgbdFrame
 
 DESCRIPTION = SourceDescription("A1", "1-1", CameraModel(), 30.0, "bayer", "raw")
+INTERVAL_NS = 33_333_333
 Step = RgbdFrame | Exception
 
 
@@ -67,11 +70,7 @@ class Recorder:
 
 
 def frames(*sequences: int) -> list[Step]:
-    return [RgbdFrame(0, sequence, time_of(sequence)) for sequence in sequences]
-
-
-def time_of(sequence: int) -> int:
-    return -(-sequence * 10**9 // 30)
+    return [RgbdFrame(0, sequence, sequence * INTERVAL_NS) for sequence in sequences]
 
 
 @pytest.fixture(autouse=True)
@@ -179,7 +178,7 @@ def test_damaged_frames_are_counted_and_passed_on(start: Start) -> None:
 )
 def test_a_faster_source_is_thinned_evenly(start: Start, max_fps: float | None, kept: range) -> None:
     _, recorder = start(frames(*range(12)), max_fps=max_fps)
-    assert [frame.timestamp_ns for frame in recorder.take(len(kept))] == [time_of(n) for n in kept]
+    assert [frame.timestamp_ns for frame in recorder.take(len(kept))] == [INTERVAL_NS * n for n in kept]
 
 
 def test_frames_left_out_on_purpose_leave_no_gap_and_lost_ones_do(start: Start) -> None:
@@ -189,9 +188,9 @@ def test_frames_left_out_on_purpose_leave_no_gap_and_lost_ones_do(start: Start) 
 
 
 def test_thinning_to_an_odd_rate_keeps_it_on_average(start: Start) -> None:
-    capture, recorder = start(frames(*range(300), 10**6), max_fps=20.0)
-    assert recorder.take(201)[-1].timestamp_ns == time_of(10**6)
-    assert capture.counters.captured == 201
+    _, recorder = start(frames(*range(300), *range(10**6, 10**6 + 3)), max_fps=20.0)
+    taken = recorder.take(201)
+    assert taken[199].timestamp_ns < 300 * INTERVAL_NS < taken[200].timestamp_ns
 
 
 @pytest.mark.parametrize(
@@ -218,22 +217,8 @@ def test_the_slower_of_what_the_operator_and_what_the_server_wants_counts(
     capture.start()
     taken = recorder.take(len(kept))
     assert capture.stop(5.0)
-    assert [frame.timestamp_ns for frame in taken] == [time_of(n) for n in kept]
+    assert [frame.timestamp_ns for frame in taken] == [INTERVAL_NS * n for n in kept]
     assert [frame.sequence for frame in taken] == list(range(len(kept)))
-
-
-@pytest.mark.parametrize("offset_ns", [0, 10**15, -(10**15), 33_333_334])
-def test_cameras_with_different_clocks_leave_out_the_same_moments(offset_ns: int) -> None:
-    """Their clocks are off by `offset_ns`; of two frames 33 ms apart, the one at even thirtieths counts."""
-    recorder = Recorder()
-    shown: list[Step] = [RgbdFrame(0, n, time_of(n) - offset_ns) for n in range(12)]
-    source = ScriptedSource(shown)
-    capture = Capture(lambda: source, None, recorder.count_opened, recorder.frames.put, recorder.failures.put)
-    capture.want(15.0, offset_ns)
-    capture.start()
-    taken = [frame.timestamp_ns + offset_ns for frame in recorder.take(6)]
-    assert capture.stop(5.0)
-    assert taken == [time_of(n) for n in range(0, 12, 2)]
 
 
 def test_what_the_server_wants_may_change_amid_the_stream() -> None:
@@ -255,7 +240,7 @@ def test_what_the_server_wants_may_change_amid_the_stream() -> None:
         recorder.failures.put,
     )
     capture.start()
-    taken = [frame.timestamp_ns * 30 // 10**9 for frame in recorder.take(75)]
+    taken = [round(frame.timestamp_ns / INTERVAL_NS) for frame in recorder.take(75)]
     assert capture.stop(5.0)
     assert taken == [*range(30), *range(30, 60, 2), *range(60, 90)]
 
@@ -266,3 +251,27 @@ def test_a_full_queue_drops_the_oldest_and_counts_it() -> None:
         queue.put(item)
     assert queue.dropped == 3
     assert [queue.get(), queue.get(), queue.get()] == [3, 4, None]
+
+
+def test_agents_with_other_clocks_leave_out_the_same_moments_of_rig_time() -> None:
+    """Three agents whose clocks differ; their cameras run freely, within one period of each other."""
+    taken = []
+    for offset_ns, phase_ns in ((0, 0), (10**12 + 7, 9_000_000), (-(10**11) - 3, 21_000_000)):
+        stamps = [INTERVAL_NS * n + phase_ns - offset_ns for n in range(40)]
+        thinning = _Thinning()
+        kept = [stamp + offset_ns for stamp in stamps if thinning.accepts(stamp + offset_ns, 7.5, 30.0)]
+        taken.append(kept[1:9])
+    for moments in zip(*taken, strict=True):
+        assert max(moments) - min(moments) <= INTERVAL_NS
+
+
+@pytest.mark.parametrize("phase_ns", range(0, 66_000_000, 1_700_000))
+def test_a_camera_of_any_phase_is_thinned_evenly_whatever_its_jitter(phase_ns: int) -> None:
+    rng, thinning = random.Random(phase_ns), _Thinning()
+    kept = [
+        n
+        for n in range(60)
+        if thinning.accepts(INTERVAL_NS * n + phase_ns + rng.randint(-200_000, 200_000), 15.0, 30.0)
+    ]
+    assert [after - before for before, after in pairwise(kept)] == [2] * (len(kept) - 1)
+    assert len(kept) >= 29

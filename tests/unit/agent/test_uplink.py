@@ -46,14 +46,14 @@ class MemoryTransport:
         self.fragments += [bytes(datagram) for datagram in batch]
         return len(batch)
 
-    def limit_rate(self, bytes_per_s: float) -> None:
-        self.rate = bytes_per_s
-
     def server_reached(self) -> None:
         return
 
     def send_datagram(self, data: bytes) -> None:
         self.sent.append(data)
+
+    def limit_rate(self, bytes_per_s: float) -> None:
+        self.rate = bytes_per_s
 
     def fileno(self) -> None:
         return None
@@ -144,7 +144,7 @@ def uplink(transport: MemoryTransport) -> Uplink:
     return uplink
 
 
-PLAN = StreamPlan(COLOR + 1, None, 15.0, 1_000_000, 100_000, 0.8, offset_ns=-(10**15) + 850_000)
+PLAN = StreamPlan(COLOR + 1, None, 15.0, 1_000_000, 350_000, 0.8, offset_ns=7_000_100_000)
 
 
 def test_before_any_plan_the_first_codecs_of_the_welcome_are_wanted_at_full_rate(
@@ -152,7 +152,7 @@ def test_before_any_plan_the_first_codecs_of_the_welcome_are_wanted_at_full_rate
 ) -> None:
     assert uplink.wanted is None
     connected(transport, uplink)
-    assert uplink.wanted == Wanted(4, COLOR, DEPTH)
+    assert uplink.wanted == Wanted(4, COLOR, DEPTH, None)
 
 
 def test_a_plan_says_what_is_wanted_and_the_next_one_replaces_it(
@@ -227,7 +227,7 @@ def test_a_lost_session_drops_what_is_unsent_and_its_plan(transport: MemoryTrans
     uplink.serve(0)
     transport.arrived.append(connected_again.seal(ClockRequest(0)))
     uplink.serve(0)
-    assert uplink.wanted == Wanted(4, COLOR, DEPTH)
+    assert uplink.wanted == Wanted(4, COLOR, DEPTH, None)
 
 
 def test_a_server_with_another_key_gets_no_frame(transport: MemoryTransport, uplink: Uplink) -> None:

@@ -550,7 +550,7 @@ def test_an_unnamed_camera_of_an_open_roster_gets_its_old_id_back() -> None:
 # ---- stream plans
 
 
-CHOICE = StreamChoice(COLOR, None, 15.0, slot=3, slots=12, step_ns=1_000_000, spread=0.8)
+CHOICE = StreamChoice(COLOR, None, 15.0, slot=3, slots=12, step_ns=1_000_000, spread=0.9)
 
 
 def plans_of(server: ServerLink, peer: AgentPeer, now_ns: int) -> list[StreamPlan]:
@@ -569,7 +569,7 @@ def test_a_plan_comes_with_every_clock_request_once_the_clock_is_known() -> None
     assert plans_of(server, peer, T0) == []
     server.plan_stream(0, CHOICE)
     plans = [plans_of(server, peer, T0 + k * SECOND_NS // 2) for k in range(1, 4)]
-    assert plans == [[StreamPlan(COLOR, None, 15.0, 1_000_000, 250_000, 0.8, 5_000_123_456)]] * 3
+    assert plans == [[StreamPlan(COLOR, None, 15.0, 1_000_000, 250_000, 0.9, 5_000_123_456)]] * 3
 
 
 def test_a_plan_is_for_the_session_that_it_was_made_for() -> None:
@@ -589,7 +589,7 @@ def test_a_plan_is_for_the_session_that_it_was_made_for() -> None:
         {"slot": 12},
         {"slot": -1},
         {"color_codec": 0},
-        {"spread": 2},
+        {"spread": 0.0},
     ],
     ids=str,
 )
@@ -617,12 +617,20 @@ def test_a_frame_leaves_in_rig_time_with_both_uncertainties() -> None:
     assert event.frame.color == make_frame().color
 
 
-def test_a_frame_before_the_first_clock_exchange_is_untimed() -> None:
+def test_frames_before_the_first_clock_exchange_wait_for_it_but_for_few() -> None:
     server = make_server()
     peer = joined_peer(server)
-    server.receive_batch(peer.fragments(make_frame(timestamp_ns=T0), 0), AGENT, T0)
+    for number in range(5):
+        server.receive_batch(peer.fragments(make_frame(number, timestamp_ns=T0), number), AGENT, T0 + number)
     assert events_of(server) == []
     assert server.cameras[0].counters.untimed == 1
+    server.handle_timeout(T0 + 5)
+    [request] = peer.read(datagram for datagram, _ in server.datagrams_to_send(T0 + 5))
+    assert isinstance(request, ClockRequest)
+    server.receive_datagram(peer.seal(ClockReply(request.t1_ns, T0 + 5, T0 + 5)), AGENT, T0 + 5)
+    frames = [event.frame for event in events_of(server)]
+    assert [(frame.sequence, frame.received_ns) for frame in frames] == [(k, T0 + k) for k in range(4)]
+    assert server.cameras[0].counters.frames == 4
 
 
 def test_a_frame_tells_when_its_last_datagram_was_here() -> None:
@@ -636,14 +644,14 @@ def test_a_frame_tells_when_its_last_datagram_was_here() -> None:
     assert event.frame.received_ns == T0 + (len(batch) - 1) * 1_000_000
 
 
-@pytest.mark.parametrize("stamp_ns", [T0 + SECOND_NS, T0 - 11 * SECOND_NS, -(2**63), 2**63 - 1])
+@pytest.mark.parametrize("stamp_ns", [T0 + 9 * SECOND_NS, T0 - 11 * SECOND_NS, -(2**63), 2**63 - 1])
 def test_a_frame_from_the_future_or_long_ago_is_untimed_and_the_clock_is_asked_soon(
     stamp_ns: int,
 ) -> None:
     server = make_server()
     agent = joined(server)
     now_ns = T0
-    while now_ns < T0 + SECOND_NS:  # the quick exchanges of the beginning
+    for _ in range(20):  # the quick exchanges of the beginning
         due_ns = server.next_timeout_ns()
         assert due_ns is not None
         now_ns = max(now_ns, due_ns)
