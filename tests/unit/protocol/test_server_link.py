@@ -772,3 +772,13 @@ def test_datagrams_may_be_any_bytes_like_object(kind: type) -> None:
 def test_a_datagram_size_out_of_range_is_misuse(size: int) -> None:
     with pytest.raises(LinkUsageError):
         make_server(datagram_size=size)
+
+
+def test_a_camera_that_the_owner_objects_to_is_refused_readably_and_holds_nothing() -> None:
+    server = make_server(objection=lambda camera_id, hello, address, now_ns: "the port is full")
+    agent = make_agent()
+    roundtrip(agent, server)
+    assert not agent.connected
+    assert events_of(agent) == [Rejected(RejectReason.NO_ROOM, "the port is full")]
+    assert server.rejected == {"refused_no_room": 1}
+    assert server.next_timeout_ns() is None
