@@ -11,7 +11,7 @@ from rig_protocol.clear_datagram import clear_crc, encode_clear
 from rig_protocol.datagram import MAGIC, Buffer, DatagramBatch, MessageType, pack_prefix
 from rig_protocol.errors import LinkUsageError
 from rig_protocol.event_queue import MAX_FRAMES
-from rig_protocol.events import Address, CameraJoined, CameraLeft, FrameReceived, HelloRefused
+from rig_protocol.events import Address, CameraJoined, CameraLeft, FrameReceived, HelloRefused, Rejected
 from rig_protocol.frames import Payload
 from rig_protocol.message_bytes import MIN_HELLO_SIZE, encode_body
 from rig_protocol.messages import (
@@ -775,7 +775,7 @@ def test_a_datagram_size_out_of_range_is_misuse(size: int) -> None:
 
 
 def test_a_camera_that_the_owner_objects_to_is_refused_readably_and_holds_nothing() -> None:
-    server = make_server(objection=lambda camera_id, hello, address, now_ns: "the port is full")
+    server = make_server(objection=lambda *_: "the port is full")
     agent = make_agent()
     roundtrip(agent, server)
     assert not agent.connected
