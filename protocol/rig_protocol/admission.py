@@ -1,6 +1,6 @@
 """Whether a hello is welcome, and what an agent is told that is not (protocol/SPEC.md, sections 5 and 6)."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 
 from rig_protocol.datagram import VERSION
 from rig_protocol.errors import DataError
@@ -11,6 +11,9 @@ from rig_protocol.server_session import CameraStatus, ServerSession
 
 # A holder that missed a heartbeat and two clock replies in a row gives way to another agent.
 HOLDER_LIVE_NS = 750_000_000
+
+Objection = Callable[[int, Hello, Address, int], str | None]
+"""Why a camera (id, hello, address) has no room at a rig time; None where it has."""
 
 Codecs = tuple[tuple[int, ...], tuple[int, ...]]
 
@@ -72,6 +75,11 @@ def wrong_key(server_is_insecure: bool) -> Reject:
         else "copy the server's key file to the agent's machine, and start neither with --insecure"
     )
     return Reject(RejectReason.WRONG_KEY, f"the agent holds another key than this rig: {advice}")
+
+
+def no_room(why: str) -> Reject:
+    """The answer to a camera whose frames do not fit the link."""
+    return Reject(RejectReason.NO_ROOM, why)
 
 
 def malformed_hello(error: DataError) -> Reject:

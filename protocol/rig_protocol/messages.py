@@ -19,6 +19,7 @@ class RejectReason(Enum):
     NO_COMMON_CODEC = 4
     MALFORMED = 5
     WRONG_KEY = 6
+    NO_ROOM = 7
     OTHER = 255  # a reason of a later version; the text says it
 
 

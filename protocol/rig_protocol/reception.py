@@ -8,10 +8,12 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 from rig_protocol.admission import (
+    Objection,
     choose_codecs,
     duplicate_slot,
     gives_way,
     malformed_hello,
+    no_room,
     version_mismatch,
     wrong_key,
 )
@@ -61,8 +63,10 @@ class Reception:
         rejected: Counter[str],
         send: Callable[[bytes, Address], None],
         tell: Callable[[HelloRefused], None],
+        objection: Objection,
     ) -> None:
         """Looks at `sessions`, counts into `rejected`."""
+        self._objection = objection
         self._roster, self._terms, self._sessions = roster, terms, sessions
         self._rig_key, self._random_bytes = rig_key, random_bytes
         self._rejected, self._send, self._tell = rejected, send, tell
@@ -151,6 +155,9 @@ class Reception:
         codecs = choose_codecs(hello, terms.color_codecs, terms.depth_codecs)
         if isinstance(codecs, Reject):
             return codecs
+        objection = self._objection(camera_id, hello, address, now_ns)
+        if objection is not None:
+            return no_room(objection)
         return Welcome(self._new_session_id(), camera_id, *codecs, terms.datagram_size, hello.ciphers[0])
 
     def _answer(self, nonce: int, datagram: Buffer, hello: Hello, welcome: Welcome, address: Address) -> None:

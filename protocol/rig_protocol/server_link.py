@@ -7,7 +7,7 @@ is due, and fetches `next_event` until None. Rules: protocol/SPEC.md, sections 6
 from collections import Counter, deque
 from collections.abc import Mapping, Sequence
 
-from rig_protocol.admission import gives_way
+from rig_protocol.admission import Objection, gives_way
 from rig_protocol.datagram import (
     DEFAULT_DATAGRAM_SIZE,
     FRAGMENT_PREFIX,
@@ -63,8 +63,12 @@ class ServerLink:
         color_codecs: Sequence[int],
         depth_codecs: Sequence[int],
         datagram_size: int = DEFAULT_DATAGRAM_SIZE,
+        objection: Objection = lambda *_: None,
     ) -> None:
-        """`random_bytes` is an unguessable source; the codecs are those that the server decodes."""
+        """`random_bytes` is an unguessable source; the codecs are those that the server decodes.
+
+        `objection` says why a camera that the roster knows is not welcome now, or None.
+        """
         if not MIN_DATAGRAM_SIZE <= datagram_size <= MAX_DATAGRAM_SIZE:
             raise LinkUsageError(
                 f"datagram size {datagram_size} is not in {MIN_DATAGRAM_SIZE}..{MAX_DATAGRAM_SIZE}"
@@ -90,6 +94,7 @@ class ServerLink:
             self.rejected,
             self._send,
             self._push,
+            objection,
         )
 
     @property

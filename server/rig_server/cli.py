@@ -105,6 +105,10 @@ def run(
         "calibration": {"method": method},
     }
     settings = load_rig_settings(config, changes)
+    if calibrate and settings.synchroniser.policy == "latest":
+        raise ConfigurationError(
+            'synchroniser.policy = "latest" repeats frames, which a calibration must not: use "partial"'
+        )
     console = Console()
     set_up_logging(settings.log_level, console)
     # What takes a second to import comes after everything that can be refused at once.

@@ -56,6 +56,7 @@ class LivePipeline:
         self._settings = settings
         self._durations = Durations()
         self._assembler = Assembler(_synchroniser(settings), self._durations.set_delivered)
+        planner = StreamPlanner(settings.link, len(settings.cameras) or settings.expected_cameras)
         self._link = ServerLink(
             _roster(settings),
             key,
@@ -63,9 +64,9 @@ class LivePipeline:
             color_codecs=COLOR_CODECS,
             depth_codecs=DEPTH_CODECS,
             datagram_size=Port(settings.link.speed_mbit, settings.link.mtu).datagram_size,
+            objection=planner.objection,
         )
-        expected = len(settings.cameras) or settings.expected_cameras
-        self._streams = StreamControl(self._link, StreamPlanner(settings.link, expected))
+        self._streams = StreamControl(self._link, planner)
         self._receiver = Receiver(
             self._link,
             settings.address,

@@ -118,6 +118,20 @@ class StreamPlanner:
         self._share_out()
         return self._choices[camera_id]
 
+    def objection(self, camera_id: int, hello: Hello, address: Address, now_ns: int) -> str | None:
+        """Why a camera that says hello has no room, and what would fit; None where it has. Without effect."""
+        if camera_id in self._choices:
+            return None
+        self._demand.join(camera_id, hello, _is_loopback(address))
+        demand = self._demand.at(self._best_from(self._level if self._choices else TOP), now_ns)
+        text = (
+            self._refusal_text(demand)
+            if not self._demand.fits(demand) and self._adds_load(camera_id)
+            else None
+        )
+        self._demand.leave(camera_id)
+        return text
+
     def camera_left(self, camera_id: int, now_ns: int) -> None:
         """A camera has gone; its share is used again once it stays away."""
         self._now_ns = now_ns
@@ -216,10 +230,13 @@ class StreamPlanner:
             demand = self._demand.at(level, self._now_ns)
             self._note(logging.INFO, plan_words.summary(demand, self._demand.port))
 
-    def _refuse(self, camera_id: int, demand: Demand) -> Refusal:
+    def _refusal_text(self, demand: Demand) -> str:
         ways = [self._demand.at(level, self._now_ns) for level in ladder(allow_jpeg=True)]
         fitting = next((one for one in ways if self._demand.fits(one)), None)
-        text = plan_words.refusal(demand, fitting, self._demand)
+        return plan_words.refusal(demand, fitting, self._demand)
+
+    def _refuse(self, camera_id: int, demand: Demand) -> Refusal:
+        text = self._refusal_text(demand)
         self._demand.leave(camera_id)
         if camera_id in self._choices:  # an agent that came again with other streams
             self._share_out()

@@ -4,7 +4,9 @@ import numpy as np
 import pytest
 
 from rig_protocol.codecs import codec_by_name
+from rig_protocol.key_file import read_key
 from support.images import mosaic
+from support.key_for_tests import rig_key_file
 from support.loopback_server import LoopbackServer
 from support.preencoded_frames import ImagePair, encode_frames, recorded_images, synthetic_images
 from support.preencoded_sender import Play, encoded_file, sender_process, total
@@ -12,7 +14,8 @@ from support.preencoded_sender import Play, encoded_file, sender_process, total
 
 @pytest.mark.parametrize("paced", [True, False])
 def test_every_frame_of_every_camera_arrives_as_it_was_encoded(paced: bool) -> None:
-    with LoopbackServer() as server, encoded_file() as (file, frames):
+    key = read_key(rig_key_file())
+    with LoopbackServer(rig_key=key) as server, encoded_file() as (file, frames):
         play = Play("{}:{}".format(*server.address), (3, 5), seconds=0.5, paced=paced)
         with sender_process(play, file) as sender:
             result = sender.result()

@@ -9,6 +9,7 @@ import pytest
 from rig_calib.evaluation import evaluate
 from rig_calib.rig_calibration import RigCalibration
 from rig_protocol.rig_folder import read_true_poses
+from support.key_for_tests import rig_key_file
 from support.real_data import real_data
 from support.rig_processes import LOOPBACK, folder_agents, free_port, run_program
 
@@ -22,7 +23,10 @@ def served(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder, out = real_data(VIEWS), tmp_path_factory.mktemp("served")
     port = free_port()
     config = out / "rig.toml"
-    config.write_text(f'listen = "{LOOPBACK}:{port}"\nexpected_cameras = {CAMERAS}\n[capture]\nframes = 1\n')
+    config.write_text(
+        f'listen = "{LOOPBACK}:{port}"\nkey_file = "{rig_key_file()}"\nexpected_cameras = {CAMERAS}\n'
+        "[capture]\nframes = 1\n"
+    )
     with folder_agents(folder, out, port, range(CAMERAS), fps=2.0):
         done = run_program("rig_server.cli", "--config", config, "--calibrate", "--out", out)
     assert done.returncode == 0, done.stdout + done.stderr

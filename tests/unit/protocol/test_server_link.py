@@ -11,7 +11,7 @@ from rig_protocol.clear_datagram import clear_crc, encode_clear
 from rig_protocol.datagram import MAGIC, Buffer, DatagramBatch, MessageType, pack_prefix
 from rig_protocol.errors import LinkUsageError
 from rig_protocol.event_queue import MAX_FRAMES
-from rig_protocol.events import Address, CameraJoined, CameraLeft, FrameReceived, HelloRefused
+from rig_protocol.events import Address, CameraJoined, CameraLeft, FrameReceived, HelloRefused, Rejected
 from rig_protocol.frames import Payload
 from rig_protocol.message_bytes import MIN_HELLO_SIZE, encode_body
 from rig_protocol.messages import (
@@ -772,3 +772,13 @@ def test_datagrams_may_be_any_bytes_like_object(kind: type) -> None:
 def test_a_datagram_size_out_of_range_is_misuse(size: int) -> None:
     with pytest.raises(LinkUsageError):
         make_server(datagram_size=size)
+
+
+def test_a_camera_that_the_owner_objects_to_is_refused_readably_and_holds_nothing() -> None:
+    server = make_server(objection=lambda *_: "the port is full")
+    agent = make_agent()
+    roundtrip(agent, server)
+    assert not agent.connected
+    assert events_of(agent) == [Rejected(RejectReason.NO_ROOM, "the port is full")]
+    assert server.rejected == {"refused_no_room": 1}
+    assert server.next_timeout_ns() is None

@@ -359,3 +359,17 @@ def test_a_rig_settles_where_the_next_better_rate_would_leave_no_room(
     if settled.fps < 30.0:
         better = min(30.0 / k for k in (1, 2, 3, 4, 5, 6, 8, 10, 15) if 30.0 / k > settled.fps)
         assert made.load * better / settled.fps > 0.95 * 0.9 - 1e-3
+
+
+def test_what_has_no_room_is_refused_at_the_door_and_leaves_no_trace() -> None:
+    planner = StreamPlanner(LinkSettings(speed_mbit=100, adapt=False), 1)
+    first, second = (replace(KINECT, camera_id=camera_id) for camera_id in range(2))
+    assert planner.objection(0, first, AWAY, 0) is None
+    assert isinstance(planner.camera_joined(0, first, AWAY, 0), StreamChoice)
+    before = dict(planner.choices), planner.demand
+    told = planner.objection(1, second, AWAY, 1)
+    assert told is not None
+    assert "[link] adapt = true would allow what fits" in told
+    assert (dict(planner.choices), planner.demand) == before
+    assert planner.objection(1, second, HERE, 1) is None  # this machine's agents load no port
+    assert planner.objection(0, first, AWAY, 2) is None  # it is here already
