@@ -30,6 +30,7 @@ CAMERAS, SECONDS, REPEATS = 12, 3.0, 5
 _SETTLE_S = 0.5
 _UDP_GRO = 104
 _KEEP_ALIVE_S = 0.1
+_CONTROL_BYTES = 300
 
 CpuSeconds = Callable[[], float]
 
@@ -38,7 +39,7 @@ class BareLoop:
     """A thread that reads everything and keeps nothing.
 
     The agents' sessions need an answering server: until all have joined every datagram goes to a link;
-    then the link only speaks, so that the agents do not take it for gone.
+    then it gets only what is too short for a fragment: clock replies and heartbeats, some 70 a second.
     """
 
     def __init__(self, use_gro: bool) -> None:
@@ -81,9 +82,12 @@ class BareLoop:
             try:
                 while True:
                     if self._merged:
-                        self.bytes += self._socket.recvmsg_into([buffer], ancillary_size)[0]
+                        size, _, _, address = self._socket.recvmsg_into([buffer], ancillary_size)
                     else:
-                        self.bytes += self._socket.recv_into(buffer)
+                        size, address = self._socket.recvfrom_into(buffer)
+                    self.bytes += size
+                    if size <= _CONTROL_BYTES:
+                        self._link.receive_datagram(buffer[:size], address, rig_time_ns())
             except BlockingIOError:
                 pass
             if (now_s := time.monotonic()) >= speak_s:
@@ -102,6 +106,7 @@ class BareLoop:
         self._speak()
 
     def _speak(self) -> None:
+        self._link.handle_timeout(rig_time_ns())
         for data, address in self._link.datagrams_to_send(rig_time_ns()):
             self._socket.sendto(data, address)
 
