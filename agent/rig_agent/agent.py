@@ -22,6 +22,7 @@ from rig_agent.hello import make_hello
 from rig_agent.sources.base import FrameSource, SourceDescription
 from rig_agent.transport import now_ns
 from rig_agent.uplink import Uplink, Wanted
+from rig_protocol.agent_session import is_due
 from rig_protocol.errors import RigError
 from rig_protocol.frames import EncodedFrame, RgbdFrame
 from rig_protocol.messages import Hello
@@ -34,6 +35,7 @@ _QUEUE_FRAMES = 2  # covers one hiccup of the next stage; older frames are stale
 _GAUGES_INTERVAL_NS = 1_000_000_000
 _TICK_S = 0.2  # how soon a thread notices that it should end
 _HUNG_NS = 60_000_000_000  # a driver call that takes longer will not return
+_LONGEST_TURN_NS = 1_000_000_000
 _STOP_TIMEOUT_S = 5.0  # closing a Kinect takes a few seconds at most
 
 
@@ -101,19 +103,19 @@ class Agent:
     def _serve_network(self) -> None:
         time_ns = gauges_due_ns = now_ns()
         health = HealthLog(self._settings.report_interval_s, time_ns)
-        watchdog = service.Watchdog()
+        watchdog, hang = service.Watchdog(), _Hang()
         service.notify("READY=1")
         while not self._stopping.is_set():
             self._wait(time_ns)
             time_ns = now_ns()
             self._forward(time_ns)
             watchdog.feed(time_ns)
-            if time_ns >= gauges_due_ns:
+            if is_due(gauges_due_ns, time_ns, _GAUGES_INTERVAL_NS):
                 gauges_due_ns = time_ns + _GAUGES_INTERVAL_NS
                 self._uplink.report_health(gauges(self.totals))
-            if time_ns >= health.due_ns:
+            if is_due(health.due_ns, time_ns, health.interval_ns):
                 _log.info("%s", health.line(self.totals, self._wanted is not None, time_ns))
-            if time_ns - self._capture.last_sign_ns > _HUNG_NS:
+            if hang.lasts(self._capture.last_sign_ns, time_ns):
                 raise RigError(f"the {self._settings.source} driver hangs: start the agent anew")
 
     def _wait(self, time_ns: int) -> None:
@@ -179,6 +181,21 @@ class Agent:
 
     def _wake_up(self) -> None:
         os.eventfd_write(self._wake, 1)
+
+
+class _Hang:
+    """Whether a driver hangs, by this loop's own turns: a jumping clock or a stopped program is no hang."""
+
+    def __init__(self) -> None:
+        self._sign_ns = self._last_ns = 0
+        self._silent_ns = 0
+
+    def lasts(self, sign_ns: int, time_ns: int) -> bool:
+        """True when no new sign has come for too long; called at every turn."""
+        passed_ns = min(max(time_ns - self._last_ns, 0), _LONGEST_TURN_NS)
+        self._silent_ns = self._silent_ns + passed_ns if sign_ns == self._sign_ns else 0
+        self._sign_ns, self._last_ns = sign_ns, time_ns
+        return self._silent_ns > _HUNG_NS
 
 
 def _same(one: Hello, other: Hello) -> bool:

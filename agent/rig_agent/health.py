@@ -59,6 +59,11 @@ class HealthLog:
         self._before = Totals()
 
     @property
+    def interval_ns(self) -> int:
+        """From one line to the next."""
+        return self._interval_ns
+
+    @property
     def due_ns(self) -> int:
         """When the next line is due."""
         return self._since_ns + self._interval_ns

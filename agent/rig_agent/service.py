@@ -3,6 +3,8 @@
 import os
 import socket
 
+from rig_protocol.agent_session import is_due
+
 
 def notify(state: str) -> None:
     """Send one state, for example READY=1; a service manager that is gone is no reason to fail."""
@@ -30,6 +32,6 @@ class Watchdog:
 
     def feed(self, now_ns: int) -> None:
         """Call often; it speaks when due."""
-        if self._interval_ns is not None and now_ns >= self._due_ns:
+        if self._interval_ns is not None and is_due(self._due_ns, now_ns, self._interval_ns):
             self._due_ns = now_ns + self._interval_ns
             notify("WATCHDOG=1")

@@ -9,6 +9,7 @@ from rig_agent.config import AgentSettings
 from rig_agent.pacer import BurstGrid, Pacer
 from rig_agent.transport import Transport
 from rig_protocol.agent_link import AgentLink
+from rig_protocol.agent_session import is_due
 from rig_protocol.events import AgentEvent, Connected, Disconnected, Rejected
 from rig_protocol.frames import EncodedFrame
 from rig_protocol.messages import Hello, StreamPlan, Welcome
@@ -138,7 +139,7 @@ class Uplink:
             self._link.handle_timeout(now_ns)
         while (event := self._link.next_event()) is not None:
             self._report(event)
-        if not self._link.connected and now_ns >= self._reopen_ns:
+        if not self._link.connected and is_due(self._reopen_ns, now_ns, _REOPEN_NS):
             self._reopen_ns = now_ns + (_REOPEN_NS if self._transport.open() else _NO_NETWORK_RETRY_NS)
         self._send_control(self._link, now_ns)
         self._follow_plan(self._link.plan)

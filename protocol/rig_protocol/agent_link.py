@@ -85,9 +85,10 @@ class AgentLink:
         self._session: AgentSession | None = None
         self._handshake: AgentHandshake | None = None
         self._health: Mapping[str, float] = {}
-        self._goodbye: bytes | None = None
+        self._last_words: list[bytes] = []
         self._events: deque[AgentEvent] = deque(maxlen=_MAX_EVENTS)
         self._hello_due_ns = 0
+        self._awaits_reject = False  # one answer a hello
         self._hello_retry_ns = HELLO_RETRY_NS[0]
         self._refused_retry_ns = REFUSED_RETRY_NS[0]
         self._seek(0)
@@ -115,11 +116,9 @@ class AgentLink:
 
         `system_clock`: what this machine's system clock is worth, for the clock replies.
         """
-        if self._goodbye is not None:
-            goodbye, self._goodbye = self._goodbye, None
-            return [goodbye]
         if self._closed:
-            return []
+            last_words, self._last_words = self._last_words, []
+            return last_words
         datagrams = self._hello_if_due(now_ns)
         if self._session is not None:
             datagrams += self._session.datagrams_to_send(now_ns, self._health, system_clock)
@@ -193,7 +192,7 @@ class AgentLink:
     def close(self, now_ns: int) -> None:  # noqa: ARG002  # the verbs of both links take the time
         """End the session with a goodbye, to be fetched with `datagrams_to_send`; nothing follows."""
         if self._session is not None:
-            self._goodbye = self._session.seal(Goodbye("the agent stops"))
+            self._last_words = self._session.last_words("the agent stops", self._health)
         self._closed, self._session, self._handshake = True, None, None
 
     # ---- dispatch: each returns the name of the cause for which a datagram was dropped
@@ -220,8 +219,9 @@ class AgentLink:
                 agreement = self._handshake.open_welcome(data)
                 self._begin(AgentSession(agreement, now_ns))
             else:
-                message = decode_body(prefix.type, bytes(data[PREFIX_SIZE:]))
-                self._refused(message, now_ns)
+                if not self._awaits_reject:  # a copy, or a forged one that would put off the next hello
+                    return "stale_answer"
+                self._refused(decode_body(prefix.type, bytes(data[PREFIX_SIZE:])), now_ns)
         except NotAuthentic:
             return "bad_seal"
         except DataError:
@@ -266,7 +266,7 @@ class AgentLink:
 
     def _say_hello(self, due_ns: int) -> None:
         self._handshake = AgentHandshake(self._hello, self._rig_key, self._random_bytes)
-        self._hello_due_ns = due_ns
+        self._hello_due_ns, self._awaits_reject = due_ns, False
         self._hello_retry_ns = HELLO_RETRY_NS[0]
 
     def _begin(self, session: AgentSession) -> None:
@@ -288,6 +288,7 @@ class AgentLink:
     def _refused(self, message: object, now_ns: int) -> None:
         if not isinstance(message, Reject):
             return
+        self._awaits_reject = False
         self._hello_due_ns = now_ns + self._refused_retry_ns
         self._refused_retry_ns = min(2 * self._refused_retry_ns, REFUSED_RETRY_NS[1])
         self.counters.rejects += 1
@@ -305,6 +306,7 @@ class AgentLink:
         self._hello_due_ns = now_ns + self._hello_retry_ns
         self._hello_retry_ns = min(2 * self._hello_retry_ns, HELLO_RETRY_NS[1])
         self.counters.hellos += 1
+        self._awaits_reject = True
         return [self._handshake.datagram]
 
 

@@ -9,7 +9,7 @@ from rig_protocol.frame_history import FrameHistory
 from rig_protocol.frames import EncodedFrame
 from rig_protocol.handshake import Agreement
 from rig_protocol.message_bytes import encode_body
-from rig_protocol.messages import ClockReply, ClockRequest, Heartbeat, Message, Resend
+from rig_protocol.messages import ClockReply, ClockRequest, Goodbye, Heartbeat, Message, Resend
 from rig_protocol.sealed_channel import SealedChannel
 from rig_protocol.security import FrameSeal
 from rig_protocol.system_clock import SystemClockReading
@@ -18,7 +18,7 @@ HEARTBEAT_INTERVAL_NS = 500_000_000
 # Until the server is heard for the first time: the first heartbeat is what begins the session there.
 CONFIRM_INTERVAL_NS = 50_000_000
 SILENCE_NS = 2_000_000_000
-# The server sends eight requests in a row; each is answered at the next turn of the shell.
+# The server sends sixteen requests in a row; each is answered at the next turn of the shell.
 _MAX_CLOCK_REQUESTS = 16
 # Four rounds of requests for every frame that is still held.
 _MAX_RESENDS = 32
@@ -64,6 +64,10 @@ class AgentSession:
         """The datagram of a message to the server."""
         return self._channel.seal(*encode_body(message))
 
+    def last_words(self, text: str, health: Mapping[str, float]) -> list[bytes]:
+        """A goodbye, and before it how many frames have left, so that the last ones are accounted for."""
+        return [self.seal(Heartbeat(health, self._sent_frames)), self.seal(Goodbye(text))]
+
     def take_clock_request(self, request: ClockRequest, now_ns: int) -> None:
         """Answer with the next datagrams."""
         self._clock_requests.append((request, now_ns))
@@ -90,9 +94,10 @@ class AgentSession:
     def cut(self, frame: EncodedFrame, datagram_size: int) -> DatagramBatch:
         """The sealed datagrams of the next frame, remembered for a while."""
         size = min(datagram_size, self.welcome.datagram_size)
-        batch = fragment(frame, self.welcome.session_id, self._frame_number, self._seal, size)
-        self.history.add(self._frame_number, batch)
-        self._frame_number += 1
+        # Taken before it is used: whatever fails, no number seals two frames.
+        number, self._frame_number = self._frame_number, self._frame_number + 1
+        batch = fragment(frame, self.welcome.session_id, number, self._seal, size)
+        self.history.add(number, batch)
         return batch
 
     def answer_resends(self, sent_of: Callable[[DatagramBatch], int]) -> tuple[list[DatagramBatch], int]:

@@ -34,8 +34,6 @@ class CameraCounters:
     oversized: int = 0
     bad_fragment: int = 0
     bad_clock_reply: int = 0
-    bad_seal: int = 0
-    replayed: int = 0
     # the agent's clock jumped; a disciplined system clock that the exchange disproves
     clock_steps: int = 0
     system_clock_disagreements: int = 0

@@ -5,7 +5,7 @@ from dataclasses import dataclass, field
 from rig_protocol.clear_datagram import encode_clear
 from rig_protocol.datagram import PREFIX_SIZE, Buffer, MessageType, pack_prefix
 from rig_protocol.errors import DataError
-from rig_protocol.message_bytes import decode_hello, decode_welcome, encode_body
+from rig_protocol.message_bytes import decode_welcome, encode_body
 from rig_protocol.messages import Hello, Welcome
 from rig_protocol.rig_key import RigKey
 from rig_protocol.security import (
@@ -64,14 +64,14 @@ class AgentHandshake:
         return Agreement(decode_welcome(body), keys)
 
 
-def open_hello(datagram: Buffer, nonce: int, rig_key: RigKey) -> Hello:
-    """The hello of an agent that holds the rig's key; NotAuthentic else, DataError when malformed."""
+def open_hello(datagram: Buffer, nonce: int, rig_key: RigKey) -> bytes:
+    """The body of a hello whose maker holds the rig's key; NotAuthentic else, DataError when too short."""
     public, sealed = _split(datagram)
     associated = _associated(MessageType.HELLO, nonce, public)
     body = open_once(hello_aead(rig_key, public), sealed, associated)
     if body is None:
         raise NotAuthentic("the hello is sealed with another key")
-    return decode_hello(body)
+    return body
 
 
 def answer_hello(

@@ -28,13 +28,21 @@ def rig_key(file: Path | None, insecure: bool) -> RigKey:
             "INSECURE: anybody on this network can watch, join and forge; only for an isolated bench"
         )
         return RigKey.INSECURE
-    found = file or next((place for place in KEY_PLACES if place.exists()), None)
+    found = file or next((place for place in KEY_PLACES if _may_exist(place)), None)
     if found is None:
         raise ConfigurationError(
             "this rig has no key: run `rig-server keygen` on the PC and copy rig.key to "
             f"{KEY_PLACES[-1]} on every machine (or run all of them with --insecure on an isolated bench)"
         )
     return read_key(found)
+
+
+def _may_exist(place: Path) -> bool:
+    """True also where the folder is closed to us: reading the file then says so."""
+    try:
+        return place.exists()
+    except PermissionError:
+        return True
 
 
 def read_key(path: Path) -> RigKey:

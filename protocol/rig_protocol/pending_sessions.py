@@ -26,6 +26,7 @@ class PendingSession:
     address: Address
     agreement: Agreement
     welcome_datagram: bytes
+    offered_ns: int
 
 
 class PendingSessions:
@@ -66,9 +67,17 @@ class PendingSessions:
         """The session begins: its hello is used."""
         pending = self._by_id.pop(session_id)
         del self._ids[pending.nonce, pending.address]
+        self._withdraw_offers(pending.agreement.welcome.camera_id)
         self._used[pending.nonce] = None
         if len(self._used) > MAX_USED_NONCES:
             self._used.popitem(last=False)
+
+    def _withdraw_offers(self, camera_id: int) -> None:
+        """The slot is taken: a heartbeat that somebody held back must not take it over."""
+        others = [one for one in self._by_id.values() if one.agreement.welcome.camera_id == camera_id]
+        for other in others:
+            del self._by_id[other.agreement.welcome.session_id]
+            del self._ids[other.nonce, other.address]
 
     def clear(self) -> None:
         """Forget those that wait."""

@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from rig_protocol.counters import CameraCounters
-from rig_protocol.datagram import FRAGMENT_HEADER_SIZE, Buffer, FragmentHeader
+from rig_protocol.datagram import FRAGMENT_HEADER_SIZE, MIN_DATAGRAM_SIZE, Buffer, FragmentHeader
 from rig_protocol.errors import DataError
 from rig_protocol.frame_unit import (
     MAX_SEALED_SIZE,
@@ -38,6 +38,8 @@ _MAX_GIVEN_UP = 1024
 # Late fragments follow soon after their unit was given up.
 _MAX_LOST_KEYS = 64
 _MAX_FRAGMENTS = 2**16
+# No honest sender cuts smaller: 1796 fragments are the most that a unit has.
+_MIN_PAYLOAD = MIN_DATAGRAM_SIZE - FRAGMENT_HEADER_SIZE
 # Buffers of units that are done, for those to come: a camera has one or two open at a time.
 _MAX_SPARE = 2
 _NEVER_NS = 2**63 - 1
@@ -221,7 +223,7 @@ class Reassembler:
             counters.duplicate += count
         elif key.unit_size > MAX_SEALED_SIZE:
             counters.oversized += count
-        elif key.unit_size < MIN_SEALED_SIZE or header.fragment_count > _MAX_FRAGMENTS:
+        elif key.unit_size < MIN_SEALED_SIZE or key.payload_size < min(key.unit_size, _MIN_PAYLOAD):
             counters.bad_fragment += count
         else:
             return self._open_fitting(key, header, now_ns)
@@ -232,13 +234,12 @@ class Reassembler:
             self._counters.evicted += 1
             self._give_up(next(iter(self._open)))
         deadline_ns = now_ns + self._interval_ns + GRACE_NS
-        self._frame_bytes = key.unit_size
         unit = OpenUnit(header, self._buffer(key.unit_size), deadline_ns, now_ns)
         unseen = self._unseen.pop(key.frame_number, None)
         unit.wholly_resent = unseen is not None and unseen.tries > 0
         self._open[key] = unit
         # A number far ahead is not believed before its frame is whole: it may be a bit error's.
-        if key.frame_number - self._next_number < NUMBER_WINDOW:
+        if key.frame_number < self._sure_number + NUMBER_WINDOW:
             self._miss_before(key.frame_number, now_ns)
             self._next_number = max(self._next_number, key.frame_number + 1)
         self._wake_at(deadline_ns)
@@ -256,6 +257,7 @@ class Reassembler:
             self._recycle(self._open.pop(other))
         self._given_up.pop(key.frame_number, None)
         self._delivered.add(key.frame_number)
+        self._frame_bytes = key.unit_size
         self._sure_number = max(self._sure_number, key.frame_number + 1)
         self._next_number = max(self._next_number, self._sure_number)
         self._move_window(key.frame_number - NUMBER_WINDOW + 1)

@@ -18,11 +18,11 @@ from rig_protocol.admission import (
     wrong_key,
 )
 from rig_protocol.clear_datagram import clear_crc, encode_clear
-from rig_protocol.datagram import VERSION, Buffer, Prefix
+from rig_protocol.datagram import MAX_DATAGRAM_SIZE, VERSION, Buffer, Prefix
 from rig_protocol.errors import DataError
 from rig_protocol.events import Address, HelloRefused
 from rig_protocol.handshake import NotAuthentic, answer_hello, fresh_id, open_hello
-from rig_protocol.message_bytes import MIN_HELLO_SIZE, encode_body
+from rig_protocol.message_bytes import MAX_CONTROL_SIZE, MIN_HELLO_SIZE, decode_hello, encode_body
 from rig_protocol.messages import Hello, Reject, UnknownSession, Welcome
 from rig_protocol.pending_sessions import PendingSession, PendingSessions
 from rig_protocol.rate_limit import RateLimit
@@ -38,7 +38,14 @@ _NOTICE_INTERVAL_ALL_NS = 5_000_000
 _HANDSHAKE_INTERVAL_NS = 10_000_000
 # Agents that lost their server in the same moment ask for it in step: all of them are to be answered at once.
 _HANDSHAKE_BURST = 64
-_REFUSAL_EVENT_INTERVAL_NS = 1_000_000_000
+_REFUSAL_EVENT_INTERVAL_NS = 1_000_000_000  # of one host
+# Of all hosts: the owner writes a log line for each, and a stranger has as many ports as he likes.
+_ALL_REFUSAL_EVENTS_INTERVAL_NS = 200_000_000
+_ALL_REFUSAL_EVENTS_BURST = 16
+# An agent whose first heartbeats are lost gives up after two seconds of silence, and says hello anew.
+_OFFER_LIFE_NS = 3_000_000_000
+# Of one hello: an agent repeats it after 100 ms at the earliest.
+_REPEAT_INTERVAL_NS = 50_000_000
 
 
 @dataclass(frozen=True, slots=True)
@@ -75,7 +82,11 @@ class Reception:
         self._notices = RateLimit(_NOTICE_INTERVAL_NS)
         self._all_notices = RateLimit(_NOTICE_INTERVAL_ALL_NS, max_keys=1)
         self._handshakes = RateLimit(_HANDSHAKE_INTERVAL_NS, max_keys=1, burst=_HANDSHAKE_BURST)
+        self._repeats = RateLimit(_REPEAT_INTERVAL_NS)
         self._refusal_events = RateLimit(_REFUSAL_EVENT_INTERVAL_NS)
+        self._all_refusal_events = RateLimit(
+            _ALL_REFUSAL_EVENTS_INTERVAL_NS, max_keys=1, burst=_ALL_REFUSAL_EVENTS_BURST
+        )
 
     def __contains__(self, session_id: int) -> bool:
         """True for a session that was offered and has not begun."""
@@ -90,7 +101,7 @@ class Reception:
         """Take a datagram whose prefix says HELLO, of whatever version."""
         if self._closed:
             self._rejected["closed"] += 1
-        elif len(datagram) < MIN_HELLO_SIZE or prefix.id == 0:
+        elif prefix.id == 0 or not MIN_HELLO_SIZE <= len(datagram) <= _longest(prefix.version):
             self._rejected["malformed"] += 1
         elif prefix.crc != clear_crc(datagram):
             self._rejected["corrupt_control"] += 1
@@ -101,9 +112,14 @@ class Reception:
             if refusal is not None:
                 self._refuse(refusal, prefix.id, address, now_ns)
 
-    def confirm(self, session_id: int, datagram: Buffer, address: Address) -> PendingSession | None:
+    def confirm(
+        self, session_id: int, datagram: Buffer, address: Address, now_ns: int
+    ) -> PendingSession | None:
         """The offered session whose agent a first sealed message proves to be there; None (counted) else."""
         pending = self._pending.of_id(session_id)
+        if pending is not None and now_ns - pending.offered_ns > _OFFER_LIFE_NS:
+            self._rejected["stale_hello"] += 1  # its agent gave up long ago: somebody held this back
+            return None
         if pending is None or pending.address != address:
             self._rejected["wrong_address"] += 1
             return None
@@ -128,7 +144,12 @@ class Reception:
             self._send(known.welcome_datagram, address)  # our answer was lost
             return None
         try:
-            hello = open_hello(datagram, nonce, self._rig_key)
+            body = open_hello(datagram, nonce, self._rig_key)
+            # What follows takes time, and the hello may be a recorded one. An agent tries again in a moment.
+            if not (self._repeats.allows(nonce, now_ns) and self._handshakes.allows("all", now_ns)):
+                self._rejected["handshake_limit"] += 1
+                return None
+            hello = decode_hello(body)
         except NotAuthentic:
             return wrong_key(self._rig_key.is_public)
         except DataError as error:
@@ -136,10 +157,7 @@ class Reception:
         welcome = self._choose(hello, address, now_ns)
         if isinstance(welcome, Reject):
             return welcome
-        if self._handshakes.allows("all", now_ns):
-            self._answer(nonce, datagram, hello, welcome, address)
-        else:  # the agent tries again in a moment
-            self._rejected["handshake_limit"] += 1
+        self._answer(nonce, datagram, hello, welcome, address, now_ns)
         return None
 
     def _choose(self, hello: Hello, address: Address, now_ns: int) -> Welcome | Reject:
@@ -160,20 +178,22 @@ class Reception:
             return no_room(objection)
         return Welcome(self._new_session_id(), camera_id, *codecs, terms.datagram_size, hello.ciphers[0])
 
-    def _answer(self, nonce: int, datagram: Buffer, hello: Hello, welcome: Welcome, address: Address) -> None:
+    def _answer(
+        self, nonce: int, datagram: Buffer, hello: Hello, welcome: Welcome, address: Address, now_ns: int
+    ) -> None:
         try:
             answer, agreement = answer_hello(datagram, nonce, welcome, self._rig_key, self._random_bytes)
         except DataError:
             self._rejected["malformed"] += 1
             return
-        self._pending.add(PendingSession(hello, nonce, address, agreement, answer))
+        self._pending.add(PendingSession(hello, nonce, address, agreement, answer, now_ns))
         self._send(answer, address)
 
     def _refuse(self, reject: Reject, nonce: int, address: Address, now_ns: int) -> None:
         self._rejected[f"refused_{reject.reason.name.lower()}"] += 1
         if self._may_notify(address, now_ns):
             self._send(encode_clear(*encode_body(reject), nonce), address)
-        if self._refusal_events.allows(address, now_ns):
+        if self._refusal_events.allows(address[0], now_ns) and self._all_refusal_events.allows("all", now_ns):
             self._tell(HelloRefused(address, reject.reason, reject.text))
 
     def _may_notify(self, address: Address, now_ns: int) -> bool:
@@ -183,6 +203,11 @@ class Reception:
         while (session_id := fresh_id(self._random_bytes)) in self._sessions or session_id in self._pending:
             continue
         return session_id
+
+
+def _longest(version: int) -> int:
+    """Bytes of a hello; other versions may have longer ones."""
+    return MAX_CONTROL_SIZE if version == VERSION else MAX_DATAGRAM_SIZE
 
 
 def _opened(pending: PendingSession, datagram: Buffer) -> bytes | str:

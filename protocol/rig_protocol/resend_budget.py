@@ -25,7 +25,8 @@ class ResendBudget:
             return pieces
         elapsed_ns = 0 if self._last_ns is None else max(0, now_ns - self._last_ns)
         self._last_ns = now_ns
-        most_bytes = self._bytes_per_s * _SAVED_NS / 1e9
+        # A piece larger than that, a whole frame, takes its time to save up.
+        most_bytes = max(self._bytes_per_s * _SAVED_NS / 1e9, piece_bytes)
         self._saved_bytes = min(self._saved_bytes + self._bytes_per_s * elapsed_ns / 1e9, most_bytes)
         granted = min(pieces, int(self._saved_bytes // piece_bytes))
         self._saved_bytes -= granted * piece_bytes

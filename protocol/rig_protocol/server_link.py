@@ -125,7 +125,9 @@ class ServerLink:
         for session in self._clock_due:
             for datagram in session.periodic_messages(now_ns):
                 self._send(datagram, session.address)
-        self._clock_due.clear()
+        if self._clock_due:
+            self._due_ns = min((session.due_ns for session in self._sessions), default=None)
+            self._clock_due.clear()
         datagrams = list(self._outgoing)
         self._outgoing.clear()
         return datagrams
@@ -159,6 +161,13 @@ class ServerLink:
         session = self._sessions.of_camera(camera_id)
         if session is not None:
             session.choose(choice)
+
+    def dismiss(self, camera_id: int, why: str) -> None:
+        """End a camera's session with a goodbye that says why."""
+        session = self._sessions.of_camera(camera_id)
+        if session is not None:
+            self._send(session.seal(Goodbye(why)), session.address)
+            self._end(session, why)
 
     def next_event(self) -> ServerEvent | None:
         """The oldest event that was not fetched yet, or None."""
@@ -214,7 +223,7 @@ class ServerLink:
 
     def _receive_sealed(self, prefix: Prefix, datagram: Buffer, address: Address, now_ns: int) -> None:
         if prefix.id in self._reception:
-            pending = self._reception.confirm(prefix.id, datagram, address)
+            pending = self._reception.confirm(prefix.id, datagram, address, now_ns)
             if pending is None or not self._begin(pending, now_ns):
                 return
         session = self._session_of(prefix.id, 1, address, now_ns)

@@ -90,13 +90,10 @@ class ServerSession:
         return self._accept(frame, now_ns)
 
     def open(self, datagram: Buffer, now_ns: int) -> bytes | str:
-        """The body of a sealed datagram, now heard; or the cause (counted) for which it is dropped."""
+        """The body of a sealed datagram, now heard; or the cause for which it is dropped."""
         body = self._channel.open(datagram)
         if not isinstance(body, str):
             self.last_heard_ns = now_ns
-        elif body in ("bad_seal", "replayed"):
-            counters = self.status.counters
-            setattr(counters, body, getattr(counters, body) + 1)
         return body
 
     def choose(self, choice: StreamChoice) -> None:
@@ -148,7 +145,14 @@ class ServerSession:
         clock = self._clock.estimate
         if self._choice is not None and clock is not None:
             messages.append(_plan(self._choice, clock.offset_ns))
+        self._refresh_due()
         return [self.seal(message) for message in messages]
+
+    def _refresh_due(self) -> None:
+        """When there is something to do next."""
+        self.due_ns = min(
+            self._clock.next_request_ns, self.last_heard_ns + SILENCE_NS, self._reassembler.due_ns
+        )
 
     def silent(self, now_ns: int) -> bool:
         """True when the agent must be taken as gone."""
@@ -157,9 +161,7 @@ class ServerSession:
     def handle_timeout(self, now_ns: int) -> list[bytes]:
         """Give up the frames whose time is over; requests for fragments that are missed."""
         requests = self._reassembler.handle_timeout(now_ns)
-        self.due_ns = min(
-            self._clock.next_request_ns, self.last_heard_ns + SILENCE_NS, self._reassembler.due_ns
-        )
+        self._refresh_due()
         return [self.seal(request) for request in requests]
 
     def close(self) -> None:

@@ -28,7 +28,7 @@ _COUNTERS = {
     ),
 }
 LOST_CAUSES = ("missing", "incomplete", "evicted", "corrupt", "unexpected_codec", "untimed", "overflow")
-_DROPPED_CAUSES = ("oversized", "bad_fragment", "bad_clock_reply", "bad_seal", "replayed")
+_DROPPED_CAUSES = ("oversized", "bad_fragment", "bad_clock_reply")
 # What RigStatus.dropped calls it; frames not decoded in time are told by camera.
 DROPPED = {
     "incomplete sets": ("rig_sets_incomplete", "Sets that the policy strict held back for want of a camera."),

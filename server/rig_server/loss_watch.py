@@ -37,7 +37,7 @@ class LossWatch:
 
     def update(self, received: Mapping[int, int], lost: Mapping[int, int], now_ns: int) -> None:
         """Take the counts since the start by camera id; those of a camera that has left are left out."""
-        if self._bin_ns is not None and now_ns - self._bin_ns < _BIN_NS:
+        if self._bin_ns is not None and 0 <= now_ns - self._bin_ns < _BIN_NS:
             return
         if self._bin_ns is not None:
             self._close_bin(_gain(self._received, received), _gain(self._lost, lost))

@@ -117,7 +117,9 @@ class _Server(socketserver.ThreadingTCPServer):
         """Start a thread for a new connection."""
         with self._lock:
             if len(self._connections) >= _MAX_CONNECTIONS:
-                _hang_up(next(iter(self._connections)))
+                oldest = next(iter(self._connections))
+                del self._connections[oldest]
+                _hang_up(oldest)
             self._connections[request] = None
         super().process_request(request, client_address)
 

@@ -5,7 +5,7 @@ import logging
 from rig_protocol.events import CameraJoined, CameraLeft, FrameReceived, ServerEvent
 from rig_protocol.messages import StreamChoice
 from rig_protocol.server_link import ServerLink
-from rig_server.stream_planner import StreamPlanner
+from rig_server.stream_planner import Refusal, StreamPlanner
 
 logger = logging.getLogger(__name__)
 
@@ -31,7 +31,9 @@ class StreamControl:
             case FrameReceived(frame):
                 self._planner.frame_received(frame)
             case CameraJoined(camera_id, hello, address):
-                self._planner.camera_joined(camera_id, hello, address, now_ns)
+                answer = self._planner.camera_joined(camera_id, hello, address, now_ns)
+                if isinstance(answer, Refusal):  # two came at once, and there is room for one
+                    self._link.dismiss(camera_id, answer.text)
                 self._told.pop(camera_id, None)  # a new session knows no plan
                 self._tell()
             case CameraLeft(camera_id):

@@ -8,7 +8,7 @@ from rig_protocol.datagram import Buffer, DatagramBatch, MessageType, parse_pref
 from rig_protocol.fragmenter import fragment
 from rig_protocol.frames import EncodedFrame
 from rig_protocol.handshake import AgentHandshake, Agreement, answer_hello, open_hello
-from rig_protocol.message_bytes import decode_body, encode_body
+from rig_protocol.message_bytes import decode_body, decode_hello, encode_body
 from rig_protocol.messages import Hello, Message, Welcome
 from rig_protocol.rig_key import RigKey
 from rig_protocol.sealed_channel import SealedChannel
@@ -48,7 +48,7 @@ class ServerPeer:
 
     def read_hello(self, datagram: bytes) -> Hello:
         """What the agent says of itself."""
-        return open_hello(datagram, id_of(datagram), self._rig_key)
+        return decode_hello(open_hello(datagram, id_of(datagram), self._rig_key))
 
     def welcome(self, hello: bytes, **changes: Any) -> bytes:
         """Answer a hello: WELCOME with changes."""

@@ -165,6 +165,16 @@ def test_a_reject_is_told_and_the_next_hellos_wait_longer_and_longer() -> None:
     assert waits == [500, 1000, 2000, 4000, REFUSED_RETRY_NS[1] // 1_000_000, 5000]
 
 
+def test_one_reject_is_taken_for_each_hello_so_that_forged_ones_cannot_put_off_the_next() -> None:
+    agent = make_agent()
+    hello = the_hello(agent)
+    for k in range(50):
+        agent.receive_datagram(clear(Reject(RejectReason.OTHER, f"go {k}"), id_of(hello)), T0 + k * 9_000_000)
+    assert events_of(agent) == [Rejected(RejectReason.OTHER, "go 0")]
+    assert agent.counters.rejected == {"stale_answer": 49}
+    assert len(agent.datagrams_to_send(T0 + REFUSED_RETRY_NS[0])) == 1
+
+
 @pytest.mark.parametrize("version", [1, 3])
 def test_a_reject_of_another_version_is_read(version: int) -> None:
     agent = make_agent()
@@ -401,7 +411,7 @@ def test_a_hello_that_cannot_be_sent_is_misuse_at_once() -> None:
 def test_closing_says_goodbye_once_and_then_nothing() -> None:
     agent, server = connected()
     agent.close(T0)
-    assert sent(agent, server, T0) == [Goodbye("the agent stops")]
+    assert sent(agent, server, T0) == [Heartbeat({}), Goodbye("the agent stops")]
     assert agent.datagrams_to_send(T0 + 10**10) == []
     assert agent.next_timeout_ns() is None
     assert agent.send_frame(make_frame(), T0) is None

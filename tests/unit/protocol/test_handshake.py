@@ -8,7 +8,7 @@ from rig_protocol.clear_datagram import clear_crc
 from rig_protocol.datagram import MessageType
 from rig_protocol.errors import DataError, LinkUsageError
 from rig_protocol.handshake import AgentHandshake, NotAuthentic, answer_hello, fresh_id, open_hello
-from rig_protocol.message_bytes import MIN_HELLO_SIZE
+from rig_protocol.message_bytes import MIN_HELLO_SIZE, decode_hello
 from rig_protocol.rig_key import RigKey
 from rig_protocol.security import EphemeralKey, SessionKeys
 from support.peers import WELCOME, id_of
@@ -42,7 +42,7 @@ def test_both_ends_hold_the_same_secrets_and_four_different_ones() -> None:
 
 def test_the_hello_says_who_the_agent_is_to_holders_of_the_key_alone() -> None:
     agent = say_hello(name="front door", serial="A1")
-    hello = open_hello(agent.datagram, agent.nonce, KEY)
+    hello = decode_hello(open_hello(agent.datagram, agent.nonce, KEY))
     assert (hello.name, hello.serial) == ("front door", "A1")
     assert b"front door" not in agent.datagram
     with pytest.raises(NotAuthentic):

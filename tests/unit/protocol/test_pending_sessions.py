@@ -10,8 +10,10 @@ AGREEMENT = Agreement(WELCOME, SessionKeys(b"", b"", b"", b""))
 
 
 def pending(number: int, nonce: int | None = None, address: tuple[str, int] = AGENT) -> PendingSession:
-    agreement = replace(AGREEMENT, welcome=replace(WELCOME, session_id=1000 + number))
-    return PendingSession(make_hello(), number if nonce is None else nonce, address, agreement, b"welcome")
+    welcome = replace(WELCOME, session_id=1000 + number, camera_id=number % 256)
+    agreement = replace(AGREEMENT, welcome=welcome)
+    known = number if nonce is None else nonce
+    return PendingSession(make_hello(), known, address, agreement, b"welcome", offered_ns=0)
 
 
 def test_one_is_found_by_its_session_and_by_the_very_hello_that_began_it() -> None:
@@ -76,3 +78,12 @@ def test_those_that_wait_can_be_forgotten_and_those_used_stay_known() -> None:
     assert 1002 not in sessions
     assert sessions.of_hello(2, AGENT) is None
     assert sessions.was_used(1)
+
+
+def test_other_offers_of_a_slot_are_withdrawn_when_one_is_taken() -> None:
+    sessions = PendingSessions()
+    for number in (1, 2, 257, 513):  # all but the second are of slot 1
+        sessions.add(pending(number))
+    sessions.take(1257)
+    assert [number for number in (1, 2, 257, 513) if 1000 + number in sessions] == [2]
+    assert len(sessions._ids) == 1

@@ -352,3 +352,25 @@ def test_a_frame_of_two_megabytes_passes_and_an_empty_one_too(size: int) -> None
         assert header is not None
         frame = reassembler.receive(header, run, count, 0)
     assert frame == make_frame(0, size=size)
+
+
+def test_forged_numbers_ahead_neither_grow_tables_nor_move_what_is_believed() -> None:
+    """A fragment 31 numbers ahead, over and over: only what is authentic moves the window."""
+    bench = Bench()
+    fragment_0 = datagrams(0)[0]
+    for k in range(1, 2000):
+        forged = with_header(fragment_0, frame_number=31 * k, seal=k)
+        bench.feed([forged], k)
+        bench.reassembler.handle_timeout(k)
+    assert len(bench.reassembler._unseen) <= NUMBER_WINDOW
+    assert bench.reassembler._next_number <= NUMBER_WINDOW
+    assert bench.feed(datagrams(0), 2000).delivered == [0]
+
+
+@pytest.mark.parametrize("payload_size", [1, 100, 1167])
+def test_fragments_smaller_than_any_sender_cuts_open_no_unit(payload_size: int) -> None:
+    bench = Bench()
+    header = FragmentHeader(1, SESSION, 0, 65_536, payload_size, 0)
+    bench.feed([pack_fragment_header(header) + bytes(payload_size)])
+    assert bench.counted() == {"bad_fragment": 1}
+    assert not bench.reassembler._open
