@@ -7,6 +7,7 @@ import argparse
 import importlib.util
 import json
 import sys
+import traceback
 from pathlib import Path
 from typing import Any
 
@@ -41,8 +42,9 @@ def measure(section: str) -> Any:
         return importlib.import_module(SECTIONS[section]).run()
     except pytest.skip.Exception as reason:
         return {"skipped": str(reason)}
-    except SystemExit as reason:  # what it waited for did not come: the other sections are still worth having
-        return {"skipped": f"it failed: {reason}"}
+    except (Exception, SystemExit) as reason:  # the other sections are still worth having
+        traceback.print_exc()
+        return {"skipped": f"it failed: {reason!r}"}
 
 
 def main() -> None:

@@ -14,6 +14,7 @@ from typing import Any
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
+from support.key_for_tests import rig_key_file
 from support.network_namespaces import Namespaces, why_unavailable
 from support.preencoded_sender import Play, encoded_file, total
 
@@ -86,6 +87,7 @@ def run() -> dict[str, Any] | list[dict[str, Any]]:
     reason = why_unavailable()
     if reason is not None:
         return {"skipped": reason}
+    rig_key_file()  # before the first program is started, so that all inherit it
     with encoded_file() as (file, _):
         return [measure(peer, file) for peer in PEERS]
 
