@@ -1,7 +1,7 @@
 """The levels that a rig steps down when its link is too small, and what each means for one camera.
 
 First less for the same picture (uncompressed → lossless), then JPEG colour, then fewer frames. All
-cameras stand on one level (docs/decisions/0009-one-level-for-all-cameras.md). Depth is always lossless.
+cameras stand on one level (docs/decisions/0008-one-level-for-all-cameras.md). Depth is always lossless.
 """
 
 import math

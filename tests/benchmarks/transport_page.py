@@ -160,9 +160,10 @@ def _switch(section: Section) -> str:
     header = ["load", "speed", "sets lost", "frames lost", "port dropped", "port busy", "fps delivered"]
     return f"""### {_TITLES["switch"]}
 
-Network namespaces on one machine: {section["hosts"]} hosts with an agent's uplink each, a real server, a switch
-whose port to the PC is shaped to 1 Gbit/s with {section["buffer_kib"]} KiB of buffer. Where two cores are too few
-for all of them the load runs in slow motion: frame rate and port rate divided alike, the buffer as it was.
+Network namespaces on one machine: {section["hosts"]} hosts with an agent's uplink each, a real server, and a
+switch whose port to the PC is shaped to 1 Gbit/s, with {section["buffer_kib"]} KiB of buffer. Where two cores
+are too few for all of them the load runs in slow motion: frame rate and port rate divided alike, the buffer
+as it was.
 Unpaced, every host sends its frame at once. RGB24 and 16-bit depth is the paper's format; 6.4 frames a second
 of it is what the port carries: delivered {100 * section["raw_ceiling_ratio"]:.1f} % of that.
 

@@ -16,7 +16,7 @@ from typing import Self
 import numpy as np
 import pytest
 
-from rig_agent.agent import Agent
+from rig_agent.agent import Agent, _Hang
 from rig_agent.config import AgentSettings, PacingSettings
 from rig_agent.sources.base import FrameSource, SourceDescription, SourceLost
 from rig_protocol.camera import CameraModel, Intrinsics
@@ -252,3 +252,17 @@ def test_a_signal_ends_the_program_with_a_goodbye_and_status_0(
     assert program.returncode == 0, log
     assert "goodbye" in server.wait_for(CameraLeft).text
     assert "Traceback" not in log
+
+
+def test_a_driver_hangs_when_this_program_ran_on_for_a_minute_without_a_sign_of_it() -> None:
+    hang, second_ns = _Hang(), 10**9
+    turns = [hang.lasts(5, k * second_ns // 5) for k in range(310)]
+    assert turns.index(True) == pytest.approx(301, abs=2)
+    assert not hang.lasts(6, 62 * second_ns)  # a sign
+
+
+@pytest.mark.parametrize("jump_ns", [3_600 * 10**9, -3_600 * 10**9])
+def test_neither_a_clock_that_jumps_an_hour_nor_a_stopped_program_is_a_hang(jump_ns: int) -> None:
+    hang = _Hang()
+    assert not hang.lasts(1, 10**13)
+    assert not hang.lasts(1, 10**13 + jump_ns)

@@ -812,3 +812,13 @@ def test_a_camera_that_the_owner_objects_to_is_refused_readably_and_holds_nothin
     assert events_of(agent) == [Rejected(RejectReason.NO_ROOM, "the port is full")]
     assert server.rejected == {"refused_no_room": 1}
     assert server.next_timeout_ns() is None
+
+
+def test_when_the_rig_clock_is_set_back_all_agents_are_asked_to_come_again() -> None:
+    server = make_server()
+    peer = joined_peer(server, now_ns=T0 + 3_600 * SECOND_NS)
+    server.receive_datagram(peer.seal(Heartbeat({})), AGENT, T0)
+    assert events_of(server) == [CameraLeft(0, "the rig clock was set back")]
+    (datagram, address), _ = server.datagrams_to_send(T0)  # and that it has no session any more
+    assert (peer.read([datagram]), address) == ([Goodbye("the rig clock was set back")], AGENT)
+    joined_peer(server, now_ns=T0, seed=9)
