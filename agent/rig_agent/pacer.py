@@ -6,9 +6,13 @@ caller gives the time and sends what `next_burst` and `next_resend` return.
 """
 
 from collections import deque
+from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Generic, TypeVar
 
 from rig_protocol.datagram import DatagramBatch
+
+F = TypeVar("F")
 
 # A sender that the machine held up sends this many bursts at once, at twice their rate, until it is in time.
 _CATCH_UP = 4
@@ -42,18 +46,28 @@ class PacerCounters:
     dropped: int = 0
 
 
-class Pacer:
-    """Holds at most two frames, the one that is being sent and the newest one after it, and resends."""
+class Pacer(Generic[F]):
+    """Holds at most two frames, the one that is being sent and the newest one after it, and resends.
 
-    def __init__(self, interval_ns: int, spread: float, burst: int) -> None:
-        """`spread` is the share of the frame interval to send over, `burst` the datagrams sent at once."""
+    A frame is cut into datagrams when its turn has come: one that gives way to a newer one has no number
+    then, and nobody misses it.
+    """
+
+    def __init__(
+        self, interval_ns: int, spread: float, burst: int, cut: Callable[[F, int], DatagramBatch | None]
+    ) -> None:
+        """`spread` is the share of the frame interval to send over, `burst` the datagrams sent at once.
+
+        `cut` gives the datagrams of a frame at an agent time, or None where nobody listens any more.
+        """
+        self._cut = cut
         self.interval_ns = interval_ns
         self.grid: BurstGrid | None = None
         self.counters = PacerCounters()
         self._spread = spread
         self._default_burst = self._burst = burst
         self._current: DatagramBatch | None = None
-        self._waiting: DatagramBatch | None = None
+        self._waiting: F | None = None
         self._position = 0
         self._started_ns = 0
         self._step_ns = 0
@@ -62,26 +76,25 @@ class Pacer:
         self._resends: deque[DatagramBatch] = deque(maxlen=_MAX_RESENDS)
         self._resend_due_ns = 0
 
-    def submit(self, batch: DatagramBatch, now_ns: int) -> list[DatagramBatch]:
-        """Take a frame to send; those given up for it: one that has not begun, or has become stale."""
+    def submit(self, frame: F, now_ns: int) -> DatagramBatch | None:
+        """Take a frame to send; one that waited gives way. The datagrams of one under way that must, too."""
         if self._current is None:
-            self._start(batch, now_ns)
-            return []
-        given_up = [] if self._waiting is None else [self._waiting]
-        self._waiting = batch
+            self._start(frame, now_ns)
+            return None
+        self.counters.dropped += self._waiting is not None
+        self._waiting = frame
         age_ns = now_ns - self._started_ns
-        fresh = -self.interval_ns <= age_ns <= _STALE_INTERVALS * self.interval_ns  # else the clock jumped
-        if self._position == 0 or not fresh:
-            given_up.append(self._current)
-            self._advance(now_ns)
-        self.counters.dropped += len(given_up)
+        if -self.interval_ns <= age_ns <= _STALE_INTERVALS * self.interval_ns:
+            return None
+        # It is stale, or the clock has jumped.
+        given_up = self._current
+        self.counters.dropped += 1
+        self._advance(now_ns)
         return given_up
 
     def sent_of(self, batch: DatagramBatch) -> int:
         """How many datagrams of a frame have left so far."""
-        if batch is self._current:
-            return self._position
-        return 0 if batch is self._waiting else len(batch)
+        return self._position if batch is self._current else len(batch)
 
     def next_burst(self, now_ns: int) -> DatagramBatch | None:
         """The datagrams that are due, or None; tell `sent` how many of them went out."""
@@ -142,7 +155,10 @@ class Pacer:
         if following is not None:
             self._start(following, now_ns)
 
-    def _start(self, batch: DatagramBatch, now_ns: int) -> None:
+    def _start(self, frame: F, now_ns: int) -> None:
+        batch = self._cut(frame, now_ns)
+        if batch is None:
+            return
         self._current, self._position = batch, 0
         if self.grid is not None and self._spread > 0:
             self._steps = max(1, int(self.interval_ns * self.grid.spread / self.grid.step_ns))

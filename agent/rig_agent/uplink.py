@@ -10,6 +10,7 @@ from rig_agent.pacer import BurstGrid, Pacer
 from rig_agent.transport import Transport
 from rig_protocol.agent_link import AgentLink
 from rig_protocol.agent_session import is_due
+from rig_protocol.datagram import DatagramBatch
 from rig_protocol.events import AgentEvent, Connected, Disconnected, Rejected
 from rig_protocol.frames import EncodedFrame
 from rig_protocol.messages import Hello, StreamPlan, Welcome
@@ -55,7 +56,7 @@ class Uplink:
         self._read_system_clock = read_system_clock
         self._datagram_size = settings.datagram_size
         self._transport = Transport(settings.address)
-        self._pacer = Pacer(_ONE_FRAME_NS, settings.pacing.spread, settings.pacing.burst)
+        self._pacer = Pacer(_ONE_FRAME_NS, settings.pacing.spread, settings.pacing.burst, self._cut)
         self._link: AgentLink | None = None
         self._plan: StreamPlan | None = None
         self._full_interval_ns = _ONE_FRAME_NS
@@ -120,13 +121,12 @@ class Uplink:
 
     def send_frame(self, frame: EncodedFrame, now_ns: int) -> None:
         """Queue a frame for sending; dropped, and counted in `unheard`, while nobody listens."""
-        batch = None if self._link is None else self._link.send_frame(frame, now_ns)
-        if self._link is None or batch is None:
+        if self._link is None or not self._link.connected:
             self.unheard += 1
             return
-        for given_up in self._pacer.submit(batch, now_ns):
+        given_up = self._pacer.submit(frame, now_ns)
+        if given_up is not None:
             self._link.give_up_frame(given_up)
-        self._limit_rate(batch.total_bytes)
 
     def serve(self, now_ns: int) -> None:
         """Receive what came, do what is due, send what is due."""
@@ -180,6 +180,14 @@ class Uplink:
         self._pacer.grid = None if plan is None else _grid(plan)
         planned_ns = 0 if plan is None else round(1e9 / plan.fps)
         self._pacer.interval_ns = max(self._full_interval_ns, planned_ns)
+
+    def _cut(self, frame: EncodedFrame, now_ns: int) -> DatagramBatch | None:
+        batch = None if self._link is None else self._link.send_frame(frame, now_ns)
+        if batch is None:
+            self.unheard += 1
+        else:
+            self._limit_rate(batch.total_bytes)
+        return batch
 
     def _limit_rate(self, frame_bytes: int) -> None:
         """Tell the kernel when the frames' rate has changed by a quarter."""

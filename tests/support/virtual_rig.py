@@ -48,9 +48,12 @@ class _Agent:
     downlink: LossyLink
     clock: AgentClock
     random: random.Random
-    pacer: Pacer = field(default_factory=lambda: Pacer(INTERVAL_NS, SPREAD, BURST))
+    pacer: Pacer[EncodedFrame] = field(init=False)
     awake_ns: int = 0  # the program sees what has arrived from here on
     sequence: int = 0
+
+    def __post_init__(self) -> None:
+        self.pacer = Pacer(INTERVAL_NS, SPREAD, BURST, self.link.send_frame)
 
 
 class VirtualRig:
@@ -105,9 +108,9 @@ class VirtualRig:
             depth=Payload(DEPTH, self._payload[split:]),
         )
         agent.sequence += 1
-        batch = agent.link.send_frame(frame, agent_ns)
-        if batch is not None:
-            for given_up in agent.pacer.submit(batch, agent_ns):
+        if agent.link.connected:
+            given_up = agent.pacer.submit(frame, agent_ns)
+            if given_up is not None:
                 agent.link.give_up_frame(given_up)
             self._serve_agent(agent)
 

@@ -9,14 +9,16 @@ from rig_protocol.datagram import DatagramBatch
 
 INTERVAL_NS = 33_333_333
 SIZE = 100
+STEP_NS = 1_000_000
 
 
 def frame(datagrams: int, fill: int = 0, last: int = SIZE) -> DatagramBatch:
     return DatagramBatch(bytes([fill]) * (SIZE * (datagrams - 1) + last), SIZE)
 
 
-def make_pacer(spread: float = 0.8, burst: int = 8) -> Pacer:
-    return Pacer(INTERVAL_NS, spread, burst)
+def make_pacer(spread: float = 0.8, burst: int = 8) -> Pacer[DatagramBatch]:
+    """Its frames are cut already."""
+    return Pacer(INTERVAL_NS, spread, burst, lambda batch, _: batch)
 
 
 def drain(pacer: Pacer, now_ns: int, until_ns: int, *, lateness_ns: int = 0) -> list[tuple[int, bytes]]:
@@ -120,13 +122,31 @@ def test_the_newest_frame_replaces_one_that_waits() -> None:
     assert (pacer.counters.sent, pacer.counters.dropped) == (2, 1)
 
 
-def test_a_frame_that_never_began_is_replaced() -> None:
-    pacer = make_pacer()
-    pacer.submit(frame(160, fill=1), 0)
-    pacer.sent(0, 0)
-    pacer.submit(frame(160, fill=2), 10)
-    assert {burst[0] for _, burst in drain(pacer, 10, 3 * INTERVAL_NS)} == {2}
-    assert (pacer.counters.sent, pacer.counters.dropped) == (1, 1)
+def test_a_frame_is_cut_when_its_turn_comes_and_never_when_it_gives_way() -> None:
+    """What is cut has a number, which the server would miss."""
+    cut: list[tuple[str, int]] = []
+
+    def cutting(name: str, now_ns: int) -> DatagramBatch:
+        cut.append((name, now_ns))
+        return frame(8)
+
+    pacer = Pacer(INTERVAL_NS, 0.8, 8, cutting)
+    pacer.grid = BurstGrid(STEP_NS, 0, 0.8)
+    for k, name in enumerate(("first", "second", "third")):
+        pacer.submit(name, k + 1)
+    drain(pacer, 3, 3 * INTERVAL_NS)
+    assert [name for name, _ in cut] == ["first", "third"]
+    assert cut[1][1] >= STEP_NS
+    assert (pacer.counters.sent, pacer.counters.dropped) == (2, 1)
+
+
+def test_a_frame_for_which_nobody_listens_any_more_is_no_hindrance() -> None:
+    pacer = Pacer[str](INTERVAL_NS, 0.8, 8, lambda name, _: frame(8) if name == "heard" else None)
+    for name in ("unheard", "heard", "unheard", "unheard"):
+        pacer.submit(name, 0)
+    drain(pacer, 0, INTERVAL_NS)
+    assert pacer.counters.sent == 1
+    assert pacer.next_timeout_ns() is None
 
 
 def test_a_frame_stuck_for_two_intervals_is_given_up_for_a_newer_one() -> None:
@@ -161,7 +181,7 @@ def test_clearing_counts_what_was_unsent() -> None:
 
 # ---- the server's grid
 
-STEP_NS = 1_000_000
+
 GRID = BurstGrid(STEP_NS, 250_000, 0.8)
 
 
@@ -318,15 +338,14 @@ def test_clearing_forgets_the_resends() -> None:
 
 def test_it_is_known_how_much_of_a_frame_has_left() -> None:
     pacer = make_pacer()
-    first, second, third = frame(160), frame(160), frame(160)
+    first, second = frame(160), frame(160)
     pacer.submit(first, 0)
     assert pacer.sent_of(first) == 0
     pacer.sent(8, 0)
-    assert pacer.submit(second, 1) == []
-    assert [pacer.sent_of(one) for one in (first, second)] == [8, 0]
-    assert pacer.submit(third, 2) == [second]  # never sent: nobody may ask for it
+    assert pacer.submit(second, 1) is None
+    assert pacer.sent_of(first) == 8
     drain(pacer, 2, 2 * INTERVAL_NS)
-    assert [pacer.sent_of(one) for one in (first, third)] == [160, 160]
+    assert [pacer.sent_of(one) for one in (first, second)] == [160, 160]
 
 
 def test_a_frame_that_got_stuck_is_told_as_given_up() -> None:
@@ -334,4 +353,4 @@ def test_a_frame_that_got_stuck_is_told_as_given_up() -> None:
     first, second = frame(160), frame(160)
     pacer.submit(first, 0)
     pacer.sent(8, 0)
-    assert pacer.submit(second, 2 * INTERVAL_NS + 1) == [first]
+    assert pacer.submit(second, 2 * INTERVAL_NS + 1) is first
