@@ -21,9 +21,9 @@ class StreamControl:
         self._due_ns = 0
 
     @property
-    def summary(self) -> str:
-        """One sentence on what is sent now and what that takes."""
-        return self._planner.summary
+    def summary(self) -> str | None:
+        """One sentence on what is sent now and what that takes; None while nothing is."""
+        return self._planner.summary if self._planner.choices else None
 
     def take(self, event: ServerEvent, now_ns: int) -> None:
         """Note what the link tells."""

@@ -29,7 +29,7 @@ from support import process_meter
 from support.key_for_tests import rig_key_file
 from support.process_meter import Cost
 
-WARM_UP_S = 3.0
+WARM_UP_S = 8.0  # until buffers and the pool of freed images have their size
 _PATIENCE_S = 30.0
 
 

@@ -53,6 +53,7 @@ def test_every_camera_is_told_its_slot() -> None:
     plans = [message for messages in said for message in messages if isinstance(message, StreamPlan)]
     assert [plan.color_codec for plan in plans] == [LOSSLESS, LOSSLESS]
     assert len({plan.phase_ns for plan in plans}) == 2
+    assert streams.summary is not None
     assert "everything goes losslessly" in streams.summary
 
 
