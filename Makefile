@@ -30,10 +30,10 @@ fuzz: $(VENV)/.ready-fuzz  ## every parser of strangers' bytes, 100 s each: FUZZ
 	    $(BIN)/python tests/fuzz/fuzz_parsers.py $$target -max_total_time=$(or $(FUZZ_SECONDS),100) || exit 1; \
 	done
 
-bench-transport: $(BENCH)  ## the transport against its bars and its peers, into docs/performance.md
+bench-transport: $(BENCH) bench-codecs  ## the transport against its bars and its peers, into docs/performance.md
 	$(BIN)/python tests/benchmarks/bench_transport.py
 
-bench: bench-codecs bench-transport  ## all figures, into build/bench.json
+bench: bench-transport  ## all figures, into build/bench.json
 
 docs: $(READY)  ## the pages that are made from the code
 	$(BIN)/python docs/generate_configuration.py
