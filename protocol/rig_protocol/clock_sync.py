@@ -13,7 +13,7 @@ FAST_REQUESTS = 16
 FAST_INTERVAL_NS = 20_000_000
 REQUEST_INTERVAL_NS = 250_000_000
 MAX_OUTSTANDING = 16
-# Ten heartbeats, which bring the agent's reading.
+# Twenty clock replies, which bring the agent's reading.
 SYSTEM_CLOCK_LIFE_NS = 5_000_000_000
 
 _STEP_UNCERTAINTIES = 4

@@ -173,7 +173,7 @@ class LivePipeline:
             case HelloRefused(address, _, text):
                 with self._presence:
                     # An agent tries on every few seconds; the operator is told once.
-                    told = any(known.address == address and known.text == text for known in self._refusals)
+                    told = any(one.address[0] == address[0] and one.text == text for one in self._refusals)
                     self._refusals.append(event)
                 logger.log(logging.DEBUG if told else logging.WARNING, "refused %s: %s", address[0], text)
 
