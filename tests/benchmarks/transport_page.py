@@ -23,6 +23,7 @@ _STYLE = {
     "axes.spines.right": False,
     "figure.constrained_layout.use": True,
 }
+_INCOMPLETE_BAR, _ADDED_BAR_MS = 0.1, 10.0  # at 5 % loss: percent of sets, and of p99
 _COLORS = {"receiver": "#4477aa", "decoder": "#ee8866", "others": "#bbbbbb", "MainThread": "#44bb99"}
 _THREADS = {
     "receiver": "receive",
@@ -275,10 +276,13 @@ def _draw_recovery(axes: Axes, section: Section) -> None:
     )
     loss, incomplete, added_ms = zip(*points, strict=True)
     axes.plot(loss, incomplete, "o-", color="#4477aa", label="incomplete sets, %")
-    axes.set_xlabel("random loss, %")
+    axes.axhline(_INCOMPLETE_BAR, color="black", linestyle=":", linewidth=1)
+    axes.set_ylim(0, 1.2 * max(_INCOMPLETE_BAR, *incomplete))
+    axes.set_xlabel("random loss, % (dotted: the bars of both)")
     axes.set_ylabel("incomplete sets, %")
     beside = axes.twinx()
     beside.spines["right"].set_visible(True)
     beside.plot(loss, added_ms, "s--", color="#ee8866", label="added p99, ms")
+    beside.set_ylim(0, 1.2 * max(_ADDED_BAR_MS, *added_ms))
     beside.set_ylabel("added p99, ms")
     axes.figure.legend(ncols=2, frameon=False, loc="outside upper center")
