@@ -103,7 +103,8 @@ class Capture:
                 self.source_counters = counted_before + Counter(source.counters)
                 if frame is None:
                     continue
-                if offset is None:  # a source that was opened again counts on where the last one ended
+                # A source that was opened again, or whose clock was set back, counts on where it was.
+                if offset is None or frame.sequence + offset < self._next_sequence:
                     offset = self._next_sequence - frame.sequence
                 if self._is_wanted(wanted, frame.timestamp_ns, description.fps):
                     self._deliver(replace(frame, sequence=frame.sequence + offset))

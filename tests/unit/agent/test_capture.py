@@ -275,3 +275,9 @@ def test_a_camera_of_any_phase_is_thinned_evenly_whatever_its_jitter(phase_ns: i
     ]
     assert [after - before for before, after in pairwise(kept)] == [2] * (len(kept) - 1)
     assert len(kept) >= 29
+
+
+def test_a_source_whose_count_goes_back_counts_on(start: Start) -> None:
+    """As that of a recording, which follows from the clock, when the clock is set back."""
+    _, recorder = start(frames(50, 51, 52, 3, 4, 6))
+    assert [frame.sequence for frame in recorder.take(6)] == [0, 1, 2, 3, 4, 6]
