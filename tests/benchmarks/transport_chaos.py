@@ -30,7 +30,7 @@ from support.udp_relay import UdpRelay
 
 CAMERAS, FPS = 12, 10.0
 PATIENCE_S = 30.0
-STEADY_SETS = 5  # whole sets in a row that count as recovered
+STEADY_SETS = 30  # whole sets in a row that count as recovered: longer than any time-out may come late
 CABLE_S, FLOOD_S = 3.0, 5.0
 FLOOD_PER_S, FLOOD_TICK_S = 50_000, 0.002
 HERE = Path(__file__).resolve().parents[1]
