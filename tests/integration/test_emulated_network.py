@@ -53,10 +53,12 @@ print(bursts, time.monotonic() - begin_s)
 """
 # Builds a network with a process in it, says so, and waits.
 BUILD = """
-import sys, time
+import subprocess, time
 from support.virtual_network import VirtualNetwork
 with VirtualNetwork(hosts=1) as network:
-    print(network.run_in("host00", ["sleep", "600"]).pid, flush=True)
+    process = network.run_in("host00", ["sh", "-c", "echo inside; exec sleep 600"], stdout=subprocess.PIPE)
+    process.stdout.readline()  # before it says so, it may not be in the network yet
+    print(process.pid, flush=True)
     time.sleep(600)
 """
 
