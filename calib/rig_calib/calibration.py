@@ -4,8 +4,8 @@ Keypoints on the overlaps, matches, 3D points, relative poses of pairs (sections
 closed over the loop (II-B). The method `joint` puts one adjustment of everything in place of the last.
 """
 
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -19,11 +19,13 @@ from rig_calib.matching import Matches, flann_matches, mutual_matches
 from rig_calib.observed_camera import ObservedCamera, missing_images, observe
 from rig_calib.overlap import Region, shared_regions
 from rig_calib.pose_graph import chain_poses, loop_error, optimise, spanning_tree
-from rig_calib.reselection import corrected, edge_evidence, reselect
+from rig_calib.refinement import RefinedRig, refine
+from rig_calib.reselection import corrected, edge_evidence
 from rig_calib.rig_adjustment import AdjustedRig, adjust_rig
 from rig_calib.rig_calibration import CalibratedCamera, CalibratedEdge, LoopClosure, RigCalibration
 from rig_calib.settings import CalibrationSettings
 from rig_calib.stages import Progress, Stages
+from rig_calib.uncertainty import weakest_direction
 from rig_calib.view import CameraView
 from rig_protocol.poses import Pose, inverse
 from rig_protocol.rig_folder import RingDrawing
@@ -32,6 +34,8 @@ Pair = tuple[int, int]
 
 # A mount may be off by several degrees and be found all the same.
 _OVERLAP_MARGIN_DEG = 7.0
+# Rough, to judge how far a prediction may be off.
+_FOCAL_PX, _NEAR_WALL_M = 525.0, 1.5
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -96,8 +100,10 @@ def calibrate(
     with stages.stage("optimisation"):
         start = _in_rig_frame(graph.poses, nominal)
         before = _in_rig_frame(_open_chain(graph), nominal)
-        solve = _solve_pose_graph if settings.method == "paper" else _solve_jointly
-        solution = solve(cameras, graph, start, ring if nominal else None, settings)
+        if settings.method == "paper":
+            solution = _solve_pose_graph(cameras, graph, start)
+        else:
+            solution = _solve_jointly(cameras, regions, graph, start, ring if nominal else None, settings)
 
     failures, warnings = _judge(views, graph, solution, ring if nominal else None, settings)
     calibration = RigCalibration(
@@ -130,7 +136,9 @@ def _observe_all(
     cameras = {}
     for k, view in enumerate(views):
         if view.camera_id in wanted:
-            cameras[view.camera_id] = observe(view, wanted[view.camera_id], settings.max_keypoints)
+            cameras[view.camera_id] = observe(
+                view, wanted[view.camera_id], settings.max_keypoints, settings.pixel_sigma
+            )
         stages.tell((k + 1) / len(views))
     return cameras
 
@@ -148,11 +156,7 @@ def _match(
 
 
 def _solve_pose_graph(
-    cameras: Mapping[int, ObservedCamera],
-    graph: ConsistentGraph,
-    start: Mapping[int, Pose],
-    _ring: RingDrawing | None,
-    _settings: CalibrationSettings,
+    cameras: Mapping[int, ObservedCamera], graph: ConsistentGraph, start: Mapping[int, Pose]
 ) -> _Solution:
     """The paper's estimate: the pairs' relative poses, closed over the loops."""
     used = [pose_edge(edge) for edge in graph.edges if edge.reason is None and edge.i in start]
@@ -162,21 +166,40 @@ def _solve_pose_graph(
 
 def _solve_jointly(
     cameras: Mapping[int, ObservedCamera],
+    regions: Mapping[Pair, tuple[Region, Region]],
     graph: ConsistentGraph,
     start: Mapping[int, Pose],
     ring: RingDrawing | None,
     settings: CalibrationSettings,
 ) -> _Solution:
-    """Adjust everything, look at all matches and at the noise again with depth corrected, adjust again."""
-    edges: Sequence[Edge] = graph.edges
+    """Adjust on keypoints, then on patches that this finds, then again with the noise that they show."""
     if len(start) < 2:
-        return _Solution(cameras, edges, {}, None)
-    rig = adjust_rig(cameras, _used_matches(edges), start, ring, settings)
-    better = {c: corrected(camera, rig.corrections.get(c)) for c, camera in cameras.items()}
-    edges = reselect(better, edges, rig.poses, settings.min_inliers)
-    rig = adjust_rig(cameras, _used_matches(edges), rig.poses, ring, settings, rig.observed_noise())
-    better = {c: corrected(camera, rig.corrections.get(c)) for c, camera in cameras.items()}
+        return _Solution(cameras, graph.edges, {}, None)
+    rig = adjust_rig(cameras, _used_matches(graph.edges), start, ring, settings)
+    refined = refine(cameras, regions, rig.poses, rig.corrections, _prediction_px(rig, regions))
+    edges = [_refined_edge(edge, refined, rig.poses) for edge in graph.edges]
+    rig = adjust_rig(refined.cameras, refined.matches, rig.poses, ring, settings)
+    rig = adjust_rig(refined.cameras, refined.matches, rig.poses, ring, settings, rig.observed_noise())
+    better = {c: corrected(camera, rig.corrections.get(c)) for c, camera in refined.cameras.items()}
     return _Solution(better, edges, rig.poses, rig)
+
+
+def _refined_edge(edge: Edge, refined: RefinedRig, poses: Mapping[int, Pose]) -> Edge:
+    """The edge with its patches for matches."""
+    matches = refined.matches.get(edge.pair)
+    if matches is None or not len(matches):
+        return edge
+    return replace(edge, matches=matches, inlier=np.ones(len(matches), dtype=bool))
+
+
+def _prediction_px(rig: AdjustedRig, pairs: Iterable[Pair]) -> dict[Pair, float]:
+    """Standard deviation, in pixels, with which the rig's poses predict where one camera sees another's point."""
+    out = {}
+    for i, j in pairs:
+        if i in rig.poses and j in rig.poses:
+            sigma_deg, sigma_m = weakest_direction(rig.relative(i, j)[1])
+            out[i, j] = _FOCAL_PX * float(np.hypot(np.deg2rad(sigma_deg), sigma_m / _NEAR_WALL_M))
+    return out
 
 
 def _used_matches(edges: Sequence[Edge]) -> dict[Pair, Matches]:

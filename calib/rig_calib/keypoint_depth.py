@@ -48,6 +48,12 @@ class KeypointDepth:
         """(N,) where there is a disparity."""
         return np.isfinite(self.disparity)
 
+    def select(self, keep: npt.NDArray[np.bool_]) -> "KeypointDepth":
+        """The keypoints that a mask names."""
+        return KeypointDepth(
+            self.disparity[keep], self.slope[keep], self.grid_pixels[keep], self.sigma[keep]
+        )
+
 
 def mean_disparity(images: Sequence[Array]) -> Array:
     """Mean (H,W) over frames of what lies within three standard deviations of the median; NaN = none.

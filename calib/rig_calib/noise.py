@@ -14,11 +14,10 @@ Array = npt.NDArray[np.float64]
 # Distances in the depth image over which noise and distortion are alike.
 _NOISE_LENGTH_PX, _DISTORTION_LENGTH_PX = 8.0, 40.0
 _NEIGHBOUR_PX = 25.0
-# A blob is placed to a share of its size (0.05 on two renderers' images, where nothing else is wrong).
-_POSITION_SHARE_OF_SCALE = 0.05
-# Two cameras that see a point share its error between them, so that each shows 1/√2 of its own; the bias
-# states follow about as much of what is left.
-_ERROR_OF_RESIDUAL = 2.0
+# The states follow some of what neighbours share, so that residuals show less of it than there is.
+_ERROR_OF_RESIDUAL = 1.3
+# A patch's source defines its point: its own residual is none.
+_EXACT_PX = 0.015
 _MAD_TO_SIGMA = 1.4826  # of a normal distribution
 _OUTLIER_SIGMAS = 3.0
 
@@ -33,13 +32,19 @@ class NoiseModel:
     """
 
     pixel_scale: float = 1.0
-    pixel_distortion: float = 0.0
+    pixel_distortion: float = 0.02
     disparity_distortion: float = 0.3 * DISPARITY_SIGMA
 
-    def keypoint_sigma(self, pixel_sigma: float, pixels: Array, scale_px: Array) -> Array:
-        """Standard deviations (N,) of one camera's keypoints: a floor, a share of their size, a crowd's."""
-        white = (self.pixel_scale * np.hypot(pixel_sigma, _POSITION_SHARE_OF_SCALE * scale_px)) ** 2
-        return np.asarray(np.sqrt(white + _crowded(self.pixel_distortion, pixels, _DISTORTION_LENGTH_PX)))
+    def pixel_whitener(self, information: Array, pixels: Array) -> Array:
+        """Whiteners W (N,2,2) of one camera's pixels: WᵀW is what is known of each in its crowd.
+
+        `information` (N,2,2) is what is known of each alone; where that is nothing in a direction, so is W.
+        """
+        share = np.linalg.eigh(information)
+        shared = _crowded(self.pixel_distortion, pixels, _DISTORTION_LENGTH_PX)[:, None]
+        known = np.maximum(share.eigenvalues, 0.0)
+        root = np.sqrt(known / (self.pixel_scale**2 + known * shared))
+        return np.asarray(root[:, :, None] * share.eigenvectors.transpose(0, 2, 1))
 
     def disparity_sigma(self, grid_pixels: Array, lookup_sigma: Array) -> Array:
         """Standard deviations (N,) of one camera's disparities, whose noise is shared over a window, too."""
@@ -51,34 +56,52 @@ class NoiseModel:
 def observed_noise(seen: Observations, residuals: Array, point_count: int) -> NoiseModel:
     """The noise that an adjustment's whitened residuals (M,3) show, at least that of a rig at rest."""
     assumed = NoiseModel()
-    count = 2 * len(residuals)
-    left = max(count - 2 * point_count, 1)  # each point takes two coordinates for itself
-    scatter = float(np.median(np.abs(residuals[:, :2])))
-    pixel_error = residuals[:, :2] * seen.pixel_sigma[:, None]
-    disparity_error = residuals[:, 2:] * seen.disparity_sigma[:, None]
+    measured = np.asarray((seen.pixel_whitener != 0.0).any(axis=(1, 2)))
+    left = max(2 * int(measured.sum()) - 2 * point_count, 1)  # each point takes two coordinates for itself
+    scatter = float(np.median(np.abs(residuals[measured, :2]))) if measured.any() else 0.0
     inlier = np.asarray((np.abs(residuals) < _OUTLIER_SIGMAS).all(axis=1))
     with_depth = np.asarray(inlier & np.isfinite(seen.disparity))
+    pixel_error, pixel_weight = seen.pixel_error(residuals[:, :2]), _pixel_information(seen)
+    measured &= pixel_weight < 1.0 / _EXACT_PX**2
+    disparity_error = residuals[:, 2:] * seen.disparity_sigma[:, None]
     return NoiseModel(
-        max(assumed.pixel_scale, _MAD_TO_SIGMA * scatter * float(np.sqrt(count / left))),
-        max(assumed.pixel_distortion, _shared_error(seen.camera, seen.pixels, pixel_error, inlier)),
+        max(assumed.pixel_scale, _MAD_TO_SIGMA * scatter * float(np.sqrt(2 * measured.sum() / left))),
+        max(
+            assumed.pixel_distortion,
+            _shared_error(seen.camera, seen.pixels, pixel_error, pixel_weight, inlier & measured),
+        ),
         max(
             assumed.disparity_distortion,
-            _shared_error(seen.camera, seen.grid_pixels, disparity_error, with_depth),
+            _shared_error(
+                seen.camera, seen.grid_pixels, disparity_error, 1.0 / seen.disparity_sigma**2, with_depth
+            ),
         ),
     )
 
 
+def _pixel_information(seen: Observations) -> Array:
+    """What is known (M,) of each pixel in its worse direction, 1/px²."""
+    information = np.einsum("mki,mkj->mij", seen.pixel_whitener, seen.pixel_whitener)
+    return np.asarray(np.maximum(np.linalg.eigvalsh(information)[:, 0], 0.0))
+
+
 def _shared_error(
-    camera: npt.NDArray[np.intp], pixels: Array, errors: Array, usable: npt.NDArray[np.bool_]
+    camera: npt.NDArray[np.intp],
+    pixels: Array,
+    errors: Array,
+    weights: Array,
+    usable: npt.NDArray[np.bool_],
 ) -> float:
     """Standard deviation of what errors (M,D) near each other in one image have in common."""
-    products, count = 0.0, 0
+    products, total = 0.0, 0.0
     for c in np.unique(camera[usable]):
         rows = np.flatnonzero(usable & (camera == c))
         near = scipy.spatial.KDTree(pixels[rows]).query_pairs(_NEIGHBOUR_PX, output_type="ndarray")
-        products += float((errors[rows[near[:, 0]]] * errors[rows[near[:, 1]]]).sum())
-        count += near.shape[0] * errors.shape[1]
-    return _ERROR_OF_RESIDUAL * float(np.sqrt(max(products, 0.0) / max(count, 1)))
+        a, b = rows[near[:, 0]], rows[near[:, 1]]
+        weight = weights[a] * weights[b]
+        products += float(weight @ (errors[a] * errors[b]).mean(axis=1))
+        total += float(weight.sum())
+    return _ERROR_OF_RESIDUAL * float(np.sqrt(max(products, 0.0) / max(total, 1e-12)))
 
 
 def _crowded(sigma: float | Array, pixels: Array, length_px: float) -> Array:

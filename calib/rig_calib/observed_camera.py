@@ -1,6 +1,6 @@
 """ObservedCamera: a camera's keypoints with their depth, all that the later stages need of its images."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
@@ -9,6 +9,7 @@ from rig_calib.depth_model import DepthGrid, depth_grid, disparity_image
 from rig_calib.features import Keypoints, detect, mean_grey
 from rig_calib.keypoint_depth import KeypointDepth, keypoint_depth, keypoint_points, mean_disparity
 from rig_calib.overlap import Region
+from rig_calib.patch_alignment import ImageF32, smoothed
 from rig_calib.registration import Side
 from rig_calib.view import CameraView
 
@@ -18,10 +19,15 @@ Index = npt.NDArray[np.intp]
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ObservedCamera:
-    """Keypoints of the colour image and, row by row, their depth and their points in the colour camera."""
+    """Keypoints of the colour image and, row by row, their depth and their points in the colour camera.
+
+    `image` (H,W) is grey and smoothed, `disparity` (H,W) is the grid's; both are means over the frames.
+    """
 
     view: CameraView
     grid: DepthGrid
+    image: ImageF32
+    disparity: Array
     keypoints: Keypoints
     depth: KeypointDepth
     points: Array
@@ -29,6 +35,21 @@ class ObservedCamera:
     def side(self, rows: Index) -> Side:
         """What registration needs of the keypoints that the rows name."""
         return Side(self.view.model.color, self.keypoints.pixels[rows], self.points[rows])
+
+    def with_keypoints(self, keypoints: Keypoints) -> "ObservedCamera":
+        """The camera with other keypoints, whose depth is looked up."""
+        depth = self.depth_at(keypoints.pixels)
+        points = keypoint_points(self.view.model.color, self.grid, keypoints.pixels, depth)
+        return replace(self, keypoints=keypoints, depth=depth, points=points)
+
+    def depth_at(self, pixels: Array) -> KeypointDepth:
+        """Depth at pixels (N,2) of the colour image."""
+        return keypoint_depth(self.view.model.color, self.grid, self.disparity, pixels, self.depth_frames)
+
+    @property
+    def depth_frames(self) -> int:
+        """How many depth images were averaged."""
+        return len(self.view.raw) or len(self.view.depth_mm)
 
 
 def missing_images(view: CameraView) -> str | None:
@@ -40,7 +61,7 @@ def missing_images(view: CameraView) -> str | None:
     return None
 
 
-def observe(view: CameraView, region: Region, max_keypoints: int) -> ObservedCamera:
+def observe(view: CameraView, region: Region, max_keypoints: int, pixel_sigma: float) -> ObservedCamera:
     """Detect keypoints in a region and look up their depth; all frames of the view are averaged.
 
     DataError when the depth images do not fit the camera model.
@@ -48,7 +69,8 @@ def observe(view: CameraView, region: Region, max_keypoints: int) -> ObservedCam
     grid = depth_grid(view.model, view.depth_frame)
     frames = len(view.raw) or len(view.depth_mm)
     disparity = mean_disparity([disparity_image(view, frame) for frame in range(frames)])
-    keypoints = detect(mean_grey(view.color), region, max_keypoints)
+    grey = mean_grey(view.color)
+    keypoints = detect(grey, region, max_keypoints, pixel_sigma)
     depth = keypoint_depth(view.model.color, grid, disparity, keypoints.pixels, frames)
     points = keypoint_points(view.model.color, grid, keypoints.pixels, depth)
-    return ObservedCamera(view, grid, keypoints, depth, points)
+    return ObservedCamera(view, grid, smoothed(grey), disparity, keypoints, depth, points)

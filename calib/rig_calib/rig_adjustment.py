@@ -22,13 +22,23 @@ from rig_protocol.rig_folder import RingDrawing
 
 Array = npt.NDArray[np.float64]
 
-# How far factory, measured and assumed colour intrinsics may be off: relative focal length, principal
-# point in pixels. Units differ from the common default by a percent and several pixels.
-_INTRINSICS_SIGMA: Mapping[ModelSource, tuple[float, float, float]] = {
-    "factory": (0.001, 0.6, 0.6),
-    "file": (0.001, 0.6, 0.6),
-    "default": (0.01, 5.0, 5.0),
-}
+@dataclass(frozen=True, slots=True)
+class _ModelSigma:
+    """How far a camera model may be off, one standard deviation.
+
+    Colour: relative focal length, principal point (px), k1. Depth grid against colour: rotation (rad), translation
+    (m); its own relative focal length and principal point (px).
+    """
+
+    color: tuple[float, float, float, float]
+    grid_pose: tuple[float, float]
+    grid: tuple[float, float, float]
+
+
+# Units differ from the common default by a percent and several pixels.
+_FACTORY = _ModelSigma((0.001, 0.6, 0.6, 0.001), (np.deg2rad(0.04), 0.0005), (0.001, 0.6, 0.6))
+_COMMON = _ModelSigma((0.01, 5.0, 5.0, 0.05), (np.deg2rad(1.0), 0.003), (0.01, 5.0, 5.0))
+_MODEL_SIGMA: Mapping[ModelSource, _ModelSigma] = {"factory": _FACTORY, "file": _FACTORY, "default": _COMMON}
 
 
 AT_REST = NoiseModel()
@@ -73,7 +83,7 @@ def adjust_rig(
     first camera does.
     """
     tracks = build_tracks(cameras, {pair: rows for pair, rows in matches.items() if set(pair) <= set(poses)})
-    scene = build_scene(cameras, tracks, poses, settings.pixel_sigma, noise)
+    scene = build_scene(cameras, tracks, poses, noise)
     drawn = ring is not None and any(cameras[c].view.T_rig_nominal is not None for c in poses)
     adjusted = [
         _adjusted_camera(
@@ -96,15 +106,19 @@ def _adjusted_camera(
     camera: ObservedCamera, start: Pose, ring: RingDrawing | None, fixed: bool, settings: CalibrationSettings
 ) -> AdjustedCamera:
     model = camera.view.model
+    sigma = _MODEL_SIGMA[model.source]
+    has_grid = camera.view.depth_frame == "depth"  # else colour and depth share one camera
     pose_sigma = None
     if ring is not None:
         pose_sigma = np.repeat([np.deg2rad(ring.tolerance_deg), ring.tolerance_m], 3)
     return AdjustedCamera(
         color=model.color,
         grid=camera.grid,
-        start=CameraState(start, np.zeros(settings.bias_terms), np.zeros(3)),
+        start=CameraState(start, np.zeros(settings.bias_terms)),
         bias_sigma=_bias_sigma(camera.grid, settings),
-        intrinsics_sigma=np.array(_INTRINSICS_SIGMA[model.source]),
+        intrinsics_sigma=np.array(sigma.color),
+        grid_pose_sigma=np.repeat(sigma.grid_pose, 3) * has_grid,
+        grid_intrinsics_sigma=np.array(sigma.grid) * has_grid,
         T_prior=None if ring is None else camera.view.T_rig_nominal,
         pose_sigma=pose_sigma,
         fixed_pose=fixed,

@@ -57,7 +57,6 @@ def build_scene(
     cameras: Mapping[int, ObservedCamera],
     tracks: Sequence[Track],
     poses: Mapping[int, Pose],
-    pixel_sigma: float,
     noise: NoiseModel,
 ) -> Scene:
     """Observations of the tracks that have depth in at least one camera, points started from that depth."""
@@ -70,7 +69,7 @@ def build_scene(
     start = observed.gather(lambda c: transform_points(poses[c.view.camera_id], c.points), 3)
     points, with_depth = _mean_points(point, start, len(tracks))
     number = np.cumsum(with_depth) - 1
-    observations = _observations(observed, number[point], pixel_sigma, noise)
+    observations = _observations(observed, number[point], noise)
     return Scene(ids, observations.select(with_depth[point]), points[with_depth])
 
 
@@ -85,20 +84,21 @@ def _mean_points(
 
 
 def _observations(
-    observed: "_Columns", point: npt.NDArray[np.intp], pixel_sigma: float, noise: NoiseModel
+    observed: "_Columns", point: npt.NDArray[np.intp], noise: NoiseModel
 ) -> Observations:
     pixels = observed.gather(lambda c: c.keypoints.pixels, 2)
     grid_pixels = observed.gather(lambda c: c.depth.grid_pixels, 2)
-    scale_px = observed.gather(lambda c: c.keypoints.scale_px, 1)[:, 0]
+    information = observed.gather(lambda c: c.keypoints.information.reshape(-1, 4), 4).reshape(-1, 2, 2)
     lookup_sigma = observed.gather(lambda c: c.depth.sigma, 1)[:, 0]
-    everything = np.ones(len(point), dtype=bool)
+    whitener = np.empty_like(information)
+    for c in np.unique(observed.camera):
+        rows = observed.camera == c
+        whitener[rows] = noise.pixel_whitener(information[rows], pixels[rows])
     return Observations(
         camera=observed.camera,
         point=point,
         pixels=pixels,
-        pixel_sigma=_by_camera(
-            observed.camera, everything, lambda r: noise.keypoint_sigma(pixel_sigma, pixels[r], scale_px[r])
-        ),
+        pixel_whitener=whitener,
         disparity=observed.gather(lambda c: c.depth.disparity, 1)[:, 0],
         slope=observed.gather(lambda c: c.depth.slope, 2),
         grid_pixels=grid_pixels,

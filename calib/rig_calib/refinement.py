@@ -1,0 +1,217 @@
+"""Patches instead of keypoints: points spread over every overlap, found in the other camera by direct alignment.
+
+Poses and depth of a first estimate say where a pixel of one camera must lie in the other. Around that place
+the image itself is aligned, to a few hundredths of a pixel and with the information that its texture holds;
+where a wall is blank, depth is compared alone (a point-to-plane term). What is found takes the keypoints' place
+in the same adjustment.
+"""
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import cv2
+import numpy as np
+import numpy.typing as npt
+
+from rig_calib.depth_model import DepthCorrection
+from rig_calib.features import Keypoints
+from rig_calib.keypoint_depth import KeypointDepth
+from rig_calib.matching import Matches
+from rig_calib.observed_camera import ObservedCamera
+from rig_calib.overlap import Region, whole_image
+from rig_calib.patch_alignment import RADIUS_PX, ImageF32, align_patches
+from rig_calib.projection import inside
+from rig_calib.surface_transfer import surface_planes, transfer, transfer_affine
+from rig_protocol.poses import Pose, inverse
+
+Array = npt.NDArray[np.float64]
+Index = npt.NDArray[np.intp]
+Mask = npt.NDArray[np.bool_]
+Pair = tuple[int, int]
+
+_CELL_PX = 16  # one patch a cell: closer ones share most of their pixels
+_MIN_CORRELATION = 0.8
+_MAX_SIGMA_PX = 0.15  # along an edge a patch slides to where it was started: that is no information
+# Interpolation, the mosaic and the lens move a patch by this much that its residuals do not show.
+_FLOOR_SIGMA_PX = 0.02
+_SOURCE_SIGMA_PX = 0.01  # a patch defines its point: all of the error is in the other image
+_BLANK_STEP = 2  # of the cells without texture, every second one compares depth
+_REACH_PX = 3.0  # farther than this, and than three standard deviations of the prediction, is another place
+_PYRAMID_FROM_PX = 1.0  # predictions worse than this are looked for in smaller images first
+_MAX_LEVELS = 2
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class RefinedRig:
+    """The cameras with patches as their keypoints, and the pairs (N,2) of them by pair of cameras."""
+
+    cameras: Mapping[int, ObservedCamera]
+    matches: Mapping[Pair, Matches]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Half:
+    """Patches of a `source` camera found in a `target`."""
+
+    source: int
+    target: int
+    source_pixels: Array
+    target_pixels: Array
+    information: Array  # on target_pixels
+
+
+def refine(
+    cameras: Mapping[int, ObservedCamera],
+    regions: Mapping[Pair, tuple[Region, Region]],
+    poses: Mapping[int, Pose],
+    corrections: Mapping[int, DepthCorrection | None],
+    prediction_px: Mapping[Pair, float],
+) -> RefinedRig:
+    """Find patches for every pair whose cameras both have a pose.
+
+    `prediction_px` is the standard deviation, in pixels, with which the poses predict where a patch lies.
+    """
+    spread = {c: _spread_pixels(camera.image) for c, camera in cameras.items() if c in poses}
+    halves = []
+    for (i, j), sides in regions.items():
+        if i in poses and j in poses:
+            halves += _align_pair(cameras, spread, (i, j), sides, poses, corrections, prediction_px[i, j])
+    return _collect(cameras, halves)
+
+
+def _align_pair(
+    cameras: Mapping[int, ObservedCamera],
+    spread: Mapping[int, Index],
+    pair: Pair,
+    sides: tuple[Region, Region],
+    poses: Mapping[int, Pose],
+    corrections: Mapping[int, DepthCorrection | None],
+    prediction_px: float,
+) -> list[_Half]:
+    """Patches of i found in j, and those of j found in i where the first have left a gap."""
+    (i, j), halves = pair, []
+    taken = np.empty((0, 2))
+    for source, target, region in ((i, j, sides[0]), (j, i, sides[1])):
+        pixels = spread[source][region.contains(spread[source].astype(np.float64))]
+        pixels = pixels[~_near(pixels, taken)]
+        T = inverse(poses[target]) @ poses[source]
+        half = _align_half(
+            cameras[source], cameras[target], T, pixels, corrections.get(source), prediction_px
+        )
+        taken = half.target_pixels
+        halves.append(half)
+    return halves
+
+
+def _align_half(
+    source: ObservedCamera,
+    target: ObservedCamera,
+    T_target_source: Pose,
+    pixels: Index,
+    correction: DepthCorrection | None,
+    prediction_px: float,
+) -> _Half:
+    ids = source.view.camera_id, target.view.camera_id
+    depth = source.depth_at(pixels.astype(np.float64))
+    pixels, depth = pixels[depth.known], depth.select(depth.known)
+    colors = source.view.model.color, target.view.model.color
+    planes = surface_planes(source.grid, depth, correction)
+    start = transfer(*colors, T_target_source, planes, pixels.astype(np.float64))
+    visible = inside(colors[1], start, -float(RADIUS_PX))
+    pixels, planes, start = pixels[visible], planes[visible], start[visible]
+    affine = transfer_affine(*colors, T_target_source, planes, pixels.astype(np.float64))
+    found, information, correlation = _align_from_coarse(source.image, target.image, pixels, start, affine, prediction_px)
+    information = _with_floor(information)
+    moved = np.linalg.norm(found - start, axis=1)
+    good = (
+        (correlation > _MIN_CORRELATION)
+        & (moved < max(_REACH_PX, 3.0 * prediction_px))
+        & (np.trace(information, axis1=1, axis2=2) > 0.0)
+    )
+    blank = ~good & (correlation < 0) & (np.arange(len(pixels)) % _BLANK_STEP == 0)
+    information[~good], found[~good] = 0.0, start[~good]
+    keep = good | blank
+    return _Half(*ids, pixels[keep].astype(np.float64), found[keep], information[keep])
+
+
+def _align_from_coarse(
+    source: ImageF32, target: ImageF32, pixels: Index, start: Array, affine: Array, prediction_px: float
+) -> tuple[Array, Array, Array]:
+    """Places, information and correlation; from coarse images to fine ones where the prediction is poor."""
+    levels = int(np.clip(np.ceil(np.log2(max(prediction_px / _PYRAMID_FROM_PX, 1.0))), 0, _MAX_LEVELS))
+    pyramids = [source], [target]
+    for pyramid in pyramids:
+        for _ in range(levels):
+            pyramid.append(np.asarray(cv2.pyrDown(pyramid[-1]), dtype=np.float32))
+    at = start.copy()
+    for level in range(levels, 0, -1):
+        scale = 0.5**level
+        coarse = np.rint(pixels * scale).astype(np.intp)
+        # The coarse patch stands beside the fine one by what rounding took.
+        beside = np.einsum("nij,nj->ni", affine, coarse / scale - pixels)
+        result = align_patches(pyramids[0][level], pyramids[1][level], coarse, (at + beside) * scale, affine)
+        better = result.correlation > _MIN_CORRELATION
+        at[better] = result.pixels[better] / scale - beside[better]
+    fine = align_patches(source, target, pixels, at, affine)
+    return fine.pixels, fine.information, fine.correlation
+
+
+def _with_floor(information: Array) -> Array:
+    """Information (N,2,2) when an error of the floor's size joins the patch's own; none where it is poor."""
+    values, vectors = np.linalg.eigh(information)
+    values = np.where(values > 1.0 / _MAX_SIGMA_PX**2, values, 0.0)
+    values = values / (1.0 + values * _FLOOR_SIGMA_PX**2)
+    return np.asarray(np.einsum("nik,nk,njk->nij", vectors, values, vectors))
+
+
+def _spread_pixels(image: ImageF32) -> Index:
+    """In every cell of the image the pixel (column, row) whose neighbourhood has most texture."""
+    texture = cv2.cornerMinEigenVal(image, 7, 3)
+    height, width = image.shape
+    rows, columns = (height - 2 * RADIUS_PX) // _CELL_PX, (width - 2 * RADIUS_PX) // _CELL_PX
+    part = texture[RADIUS_PX : RADIUS_PX + rows * _CELL_PX, RADIUS_PX : RADIUS_PX + columns * _CELL_PX]
+    cells = part.reshape(rows, _CELL_PX, columns, _CELL_PX).swapaxes(1, 2).reshape(rows, columns, -1)
+    down, right = np.divmod(cells.argmax(axis=2), _CELL_PX)
+    row, column = np.mgrid[:rows, :columns] * _CELL_PX + RADIUS_PX
+    return np.stack([column + right, row + down], axis=-1).reshape(-1, 2)
+
+
+def _near(pixels: Index, taken: Array) -> Mask:
+    """Which pixels (N,2) have one of `taken` (K,2) within a patch's reach."""
+    if not len(taken) or not len(pixels):
+        return np.zeros(len(pixels), dtype=bool)
+    squared = ((pixels[:, None] - taken[None]) ** 2).sum(axis=2)
+    return np.asarray(squared.min(axis=1) < (0.75 * _CELL_PX) ** 2)
+
+
+def _collect(cameras: Mapping[int, ObservedCamera], halves: Sequence[_Half]) -> RefinedRig:
+    """The patches of all halves as keypoints of their cameras."""
+    pixels: dict[int, list[Array]] = {c: [] for c in cameras}
+    information: dict[int, list[Array]] = {c: [] for c in cameras}
+    count = dict.fromkeys(cameras, 0)
+    matches: dict[Pair, list[Matches]] = {}
+
+    def add(camera: int, places: Array, known: Array) -> Index:
+        pixels[camera].append(places)
+        information[camera].append(known)
+        first, count[camera] = count[camera], count[camera] + len(places)
+        return np.arange(first, count[camera])
+
+    for half in halves:
+        exact = np.broadcast_to(np.eye(2) / _SOURCE_SIGMA_PX**2, half.information.shape)
+        ends = {
+            half.source: add(half.source, half.source_pixels, exact),
+            half.target: add(half.target, half.target_pixels, half.information),
+        }
+        pair = min(ends), max(ends)
+        matches.setdefault(pair, []).append(np.column_stack([ends[pair[0]], ends[pair[1]]]))
+    refined = {
+        c: camera.with_keypoints(_keypoints(pixels[c], information[c])) for c, camera in cameras.items()
+    }
+    return RefinedRig(refined, {pair: np.concatenate(rows) for pair, rows in matches.items()})
+
+
+def _keypoints(pixels: Sequence[Array], information: Sequence[Array]) -> Keypoints:
+    places = np.concatenate([np.empty((0, 2)), *pixels])
+    known = np.concatenate([np.empty((0, 2, 2)), *information])
+    return Keypoints(places, known, np.empty((len(places), 0), dtype=np.float32), np.arange(len(places)))
