@@ -34,6 +34,11 @@ class Keypoints:
         """How many keypoints there are."""
         return len(self.pixels)
 
+    @property
+    def has_place(self) -> npt.NDArray[np.bool_]:
+        """(N,) where anything is known of the pixel."""
+        return np.asarray(np.trace(self.information, axis1=1, axis2=2) > 0.0)
+
 
 def mean_grey(images: Sequence[ImageU8]) -> ImageU8:
     """One grey image (H,W) of K grey or BGR images of a scene at rest: less noise, same place."""

@@ -6,7 +6,7 @@ where a wall is blank, depth is compared alone (a point-to-plane term). What is 
 in the same adjustment.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping, Sequence, Set
 from dataclasses import dataclass
 
 import cv2
@@ -66,16 +66,19 @@ def refine(
     poses: Mapping[int, Pose],
     corrections: Mapping[int, DepthCorrection | None],
     prediction_px: Mapping[Pair, float],
+    depth_only: Set[Pair] = frozenset(),
 ) -> RefinedRig:
     """Find patches for every pair whose cameras both have a pose.
 
-    `prediction_px` is the standard deviation, in pixels, with which the poses predict where a patch lies.
+    `prediction_px` is the standard deviation, in pixels, with which the poses predict where a patch lies. Pairs
+    of `depth_only` compare depth alone, which leads to the right place from farther away than texture does.
     """
     spread = {c: _spread_pixels(camera.image) for c, camera in cameras.items() if c in poses}
     halves = []
     for (i, j), sides in regions.items():
         if i in poses and j in poses:
-            halves += _align_pair(cameras, spread, (i, j), sides, poses, corrections, prediction_px[i, j])
+            reach = None if (i, j) in depth_only else prediction_px[i, j]
+            halves += _align_pair(cameras, spread, (i, j), sides, poses, corrections, reach)
     return _collect(cameras, halves)
 
 
@@ -86,7 +89,7 @@ def _align_pair(
     sides: tuple[Region, Region],
     poses: Mapping[int, Pose],
     corrections: Mapping[int, DepthCorrection | None],
-    prediction_px: float,
+    prediction_px: float | None,
 ) -> list[_Half]:
     """Patches of i found in j, and those of j found in i where the first have left a gap."""
     (i, j), halves = pair, []
@@ -109,7 +112,7 @@ def _align_half(
     T_target_source: Pose,
     pixels: Index,
     correction: DepthCorrection | None,
-    prediction_px: float,
+    prediction_px: float | None,
 ) -> _Half:
     ids = source.view.camera_id, target.view.camera_id
     depth = source.depth_at(pixels.astype(np.float64))
@@ -119,6 +122,8 @@ def _align_half(
     start = transfer(*colors, T_target_source, planes, pixels.astype(np.float64))
     visible = inside(colors[1], start, -float(RADIUS_PX))
     pixels, planes, start = pixels[visible], planes[visible], start[visible]
+    if prediction_px is None:
+        return _Half(*ids, pixels.astype(np.float64), start, np.zeros((len(pixels), 2, 2)))
     affine = transfer_affine(*colors, T_target_source, planes, pixels.astype(np.float64))
     found, information, correlation = _align_from_coarse(source.image, target.image, pixels, start, affine, prediction_px)
     information = _with_floor(information)
