@@ -48,6 +48,8 @@ _GRADUATED_NOISE = tuple(
 )
 _FAR_AND_WIDE_PX = 4.0  # predictions worse than this find false places, too
 DEBUG=None
+# Fewer patches that were found far from where the drawing has them may agree by chance.
+_MIN_PATCHES = 20
 _NO_MATCHES: Matches = np.empty((0, 2), dtype=np.intp)
 
 
@@ -235,7 +237,7 @@ def _verified(
             rng = np.random.default_rng([settings.seed, i, j])
             found = ransac(*sides, TOLERANCE, rng, settings.min_inliers)
             agreed = agreed[found[1]] if found is not None else _NO_MATCHES
-        bare = (i, j) in far and len(agreed) < settings.min_inliers
+        bare = (i, j) in far and len(agreed) < _MIN_PATCHES
         out[i, j] = _NO_MATCHES if bare else np.concatenate([agreed, rows[~textured]])
     return out
 
