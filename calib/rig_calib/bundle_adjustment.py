@@ -1,26 +1,34 @@
-"""One robust adjustment of all camera states and all points (Triggs et al., "Bundle Adjustment", 2000).
+"""One robust adjustment of all camera states and all landmarks (Triggs et al., "Bundle Adjustment", 2000).
 
-Levenberg-Marquardt on iteratively reweighted least squares with a Cauchy kernel; the points are eliminated
-by the Schur complement. Every camera carries priors: on its pose (the drawing), depth bias, intrinsics.
+Levenberg-Marquardt with a Cauchy kernel; the landmarks are eliminated by the Schur complement. Landmarks are
+points, planes that cameras share, and the direction of gravity. Every camera carries priors: on its pose (the
+drawing) and on what is wrong with its factory model.
 """
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
 import numpy.typing as npt
+import scipy.linalg
+import scipy.sparse
+import scipy.sparse.linalg
+from scipy.spatial.transform import Rotation
 
+from rig_calib.camera_priors import CameraPriors, prior_pose, weights_of
 from rig_calib.depth_model import DepthGrid
+from rig_calib.landmark_rows import GravityObservations, LandmarkCounts, LandmarkRows, Rows
+from rig_calib.normal_equations import Groups, Landmarks, eliminate, landmark_steps, reweight, robust_cost
 from rig_calib.observation_model import (
-    INTRINSIC_TERMS,
-    POSE,
+    GRID_INTRINSIC_TERMS,
+    GRID_POSE_TERMS,
     CameraState,
+    FactoryModels,
     Observations,
-    jacobians,
-    residuals,
+    PlaneObservations,
 )
 from rig_protocol.camera import Intrinsics
-from rig_protocol.poses import Pose, inverse, se3_exp, se3_log
+from rig_protocol.poses import Pose
 
 Array = npt.NDArray[np.float64]
 Index = npt.NDArray[np.intp]
@@ -28,18 +36,24 @@ Index = npt.NDArray[np.intp]
 # Where the kernel starts to bend, in standard deviations: 95 % efficiency on clean data (Holland &
 # Welsch 1977), squared, for a pixel's two coordinates and for a disparity.
 _CAUCHY_SQUARED = 2.385**2
-# The same for the six numbers of a pose prior: their 95 % quantile.
-_CAUCHY_SQUARED_POSE = 12.6
+_LEAST_CURVATURE = 0.2  # beyond the kernel's bend its curvature is negative
+_NEAR = 0.003  # relative decrease of the cost to be expected
 _MAX_ITERATIONS = 40
-_CONVERGED = 1e-6  # relative decrease of the cost
+_CONVERGED = 1e-6
+_LEAST_COST = 1e-12
+_FIRST_DAMPING, _LEAST_DAMPING, _MAX_DAMPING = 1e-6, 1e-12, 1e8
+# From here on, 40 cameras or so, a ring is solved faster as a sparse system.
+_MANY_STATES = 1000
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class AdjustedCamera:
-    """One camera of a problem: fixed models, priors, and the state to start from.
+    """One camera of a problem: factory models, priors, and the state to start from.
 
-    `T_prior` with `pose_sigma` (6,) is the drawing's pose; None = no prior. `bias_sigma` (B,) and
-    `intrinsics_sigma` (3,) are standard deviations about zero. A fixed pose defines the frame.
+    `T_prior` with `pose_sigma` (6,) is the drawing's pose; None = no prior. A fixed pose defines the frame.
+    The other `_sigma`s are standard deviations, about `expected` (None: the factory model), of a
+    `CameraState`'s fields; 0 holds a term at its start. `gravity` (3,) is down in the camera frame, known to
+    `gravity_sigma` rad.
     """
 
     color: Intrinsics
@@ -47,209 +61,254 @@ class AdjustedCamera:
     start: CameraState
     bias_sigma: Array
     intrinsics_sigma: Array
+    grid_pose_sigma: Array = field(default_factory=lambda: np.zeros(GRID_POSE_TERMS))
+    grid_intrinsics_sigma: Array = field(default_factory=lambda: np.zeros(GRID_INTRINSIC_TERMS))
+    expected: CameraState | None = None
     T_prior: Pose | None = None
     pose_sigma: Array | None = None
     fixed_pose: bool = False
+    gravity: Array | None = None
+    gravity_sigma: float = float(np.deg2rad(0.5))
+
+    def sigma_beside_pose(self) -> Array:
+        """Standard deviations (S−6,) in the order of `CameraState.beside_pose`."""
+        return np.concatenate(
+            [self.bias_sigma, self.intrinsics_sigma, self.grid_pose_sigma, self.grid_intrinsics_sigma]
+        )
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Adjustment:
-    """The result: states, points, and the normal matrix that is left when the points are eliminated.
+    """The result: states, landmarks, and the normal matrix that is left when the landmarks are eliminated.
 
-    `normal` (C·S, C·S) holds the information on all camera states (rows of fixed poses are zero);
-    `weights` (M,2) are the kernel's for pixel and disparity; `residuals` (M,3) are whitened.
+    `normal` (C·S, C·S) holds the information on all camera states (rows of what is held are zero); `weights`
+    (M,2) are the kernel's for pixel and disparity; `residuals` (M,3) and `plane_residuals` are whitened.
     """
 
     states: tuple[CameraState, ...]
     points: Array
+    planes: Array
     normal: Array
     residuals: Array
+    plane_residuals: Array
     weights: Array
     cost: float
     iterations: int
 
 
+def adjust(
+    cameras: Sequence[AdjustedCamera],
+    points: Array,
+    seen: Observations,
+    planes: Array | None = None,
+    seen_planes: PlaneObservations | None = None,
+) -> Adjustment:
+    """Minimise the robust cost from the cameras' start states, `points` (P,3) and `planes` (K,3), rig frame.
+
+    A plane π holds the points X with π · X = 1. Every point needs two observations or more. Without pose
+    priors one pose must be fixed.
+    """
+    planes = np.empty((0, 3)) if planes is None else planes
+    seen_planes = PlaneObservations.none() if seen_planes is None else seen_planes
+    problem = _Problem.of(cameras, LandmarkCounts(len(points), len(planes)), seen, seen_planes)
+    here = problem.evaluate(_start(cameras, points, planes))
+    damping, decrease, iterations = _FIRST_DAMPING, 1.0, 0
+    while decrease > _CONVERGED and iterations < _MAX_ITERATIONS:
+        iterations += 1
+        here, damping, decrease = _descend(problem, here, damping, decrease < _NEAR)
+    return _result(problem, here, iterations)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Estimate:
+    """Poses (C,4,4), states beside them (C,S−6), and landmarks (L,3): points, planes, gravity."""
+
+    T_rig_camera: Array
+    beside_pose: Array
+    landmarks: Array
+
+    def moved(self, steps: Array, landmarks: Landmarks, groups: Groups) -> "_Estimate":
+        """Steps of the cameras (C·S,) and of the landmarks that go with them; T · Exp(δ) to first order."""
+        by_camera, by_landmark = steps.reshape(len(self.T_rig_camera), -1), np.empty_like(self.landmarks)
+        landmark_steps(groups.camera, groups.first_group, *landmarks, by_camera, by_landmark)
+        R = self.T_rig_camera[:, :3, :3]
+        poses = self.T_rig_camera.copy()
+        poses[:, :3, :3] = R @ Rotation.from_rotvec(by_camera[:, :3]).as_matrix()
+        poses[:, :3, 3] += (R @ by_camera[:, 3:6, None])[..., 0]
+        return _Estimate(poses, self.beside_pose + by_camera[:, 6:], self.landmarks + by_landmark)
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Evaluation:
+    """An estimate with its rows and cost."""
+
+    estimate: _Estimate
+    rows: Rows
+    cost: float
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Reduced:
+    """Normal equations of the cameras: lower triangle of `normal` (C·S,C·S), and `gradient` (C·S,)."""
+
+    normal: Array
+    gradient: Array
+    landmarks: Landmarks
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class _Problem:
-    cameras: Sequence[AdjustedCamera]
-    seen: Observations
-    rows: tuple[Index, ...]  # observations of each camera
-    pairs: Mapping[tuple[int, int], tuple[Index, Index]]  # observations of one point by two cameras
-    point_count: int
-    state_size: int = field(init=False)
+    models: FactoryModels
+    priors: CameraPriors
+    observed: LandmarkRows
+    free: Index  # columns of all states that are not held
 
-    def __post_init__(self) -> None:
-        object.__setattr__(self, "state_size", 6 + len(self.cameras[0].bias_sigma) + INTRINSIC_TERMS)
+    @classmethod
+    def of(
+        cls,
+        cameras: Sequence[AdjustedCamera],
+        counts: LandmarkCounts,
+        seen: Observations,
+        seen_planes: PlaneObservations,
+    ) -> "_Problem":
+        models = FactoryModels.of(
+            [camera.color for camera in cameras],
+            [camera.grid for camera in cameras],
+            len(cameras[0].bias_sigma),
+        )
+        held = np.array([camera.fixed_pose for camera in cameras])
+        varies = np.array([camera.sigma_beside_pose() > 0.0 for camera in cameras])
+        free = np.concatenate([np.repeat(~held[:, None], 6, axis=1), varies], axis=1)
+        observed = LandmarkRows(models, counts, seen, seen_planes, _gravity(cameras))
+        return cls(models, _priors(cameras), observed, np.flatnonzero(free))
+
+    def evaluate(self, estimate: _Estimate) -> _Evaluation:
+        rows = self.observed.rows(
+            self.models.with_states(estimate.T_rig_camera, estimate.beside_pose), estimate.landmarks
+        )
+        cost = robust_cost(self.observed.kernels, rows.residual, _CAUCHY_SQUARED)
+        return _Evaluation(
+            estimate, rows, cost + self.priors.cost(estimate.T_rig_camera, estimate.beside_pose)
+        )
+
+    def reduce(self, estimate: _Estimate, rows: Rows, damping: float) -> _Reduced:
+        """Eliminate the landmarks from rows that are weighted."""
+        count, size = len(estimate.T_rig_camera), self.models.state_size
+        information, gradient = self.priors.normal_equations(estimate.T_rig_camera, estimate.beside_pose)
+        normal = np.zeros((count, size, count, size))
+        np.einsum("cscs->cs", normal)[:] = information
+        landmarks = eliminate(self.observed.groups, *rows, damping, normal, gradient)
+        return _Reduced(normal.reshape(count * size, count * size), gradient.ravel(), landmarks)
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class _Linearised:
-    """Normal equations [[U, W], [Wᵀ, V]] with gradients; W stays factored by observation."""
+def _descend(
+    problem: _Problem, here: _Evaluation, damping: float, near: bool
+) -> tuple[_Evaluation, float, float]:
+    """One step downhill: where it leads, the next one's damping, and the share of the cost expected of it.
 
-    U: Array  # (C,S,S)
-    V: Array  # (P,3,3)
-    W: Array  # (M,S,3)
-    camera_gradient: Array  # (C,S)
-    point_gradient: Array  # (P,3)
-
-
-def adjust(cameras: Sequence[AdjustedCamera], points: Array, seen: Observations) -> Adjustment:
-    """Minimise the robust cost from the cameras' start states and `points` (P,3), rig frame.
-
-    Every point needs two observations or more. Without pose priors one pose must be fixed.
+    Far from the minimum reweighted least squares is safe; near it, the kernel's own curvature is fast. Turns
+    the rows of `here` into weighted ones.
     """
-    problem = _Problem(cameras, seen, _rows(seen.camera, len(cameras)), _co_observations(seen), len(points))
-    states = tuple(camera.start for camera in cameras)
-    errors = _residuals(problem, states, points)
-    cost, damping, iterations = _cost(problem, states, errors), 1e-4, 0
-    while iterations < _MAX_ITERATIONS:
-        iterations += 1
-        system = _linearise(problem, states, points, errors)
-        previous = cost
-        while damping < 1e8:
-            new_states, new_points = _step(problem, states, points, system, damping)
-            new_errors = _residuals(problem, new_states, new_points)
-            new_cost = _cost(problem, new_states, new_errors)
-            if new_cost <= cost:
-                states, points, errors, cost = new_states, new_points, new_errors, new_cost
-                damping = max(damping * 0.1, 1e-12)
-                break
-            damping *= 10.0
-        if previous - cost <= _CONVERGED * previous:
+    reweight(problem.observed.kernels, *here.rows, _CAUCHY_SQUARED, _LEAST_CURVATURE if near else 1.0)
+    while damping < _MAX_DAMPING:
+        system = problem.reduce(here.estimate, here.rows, damping)
+        steps = _solve(system, problem.free, damping)
+        there = problem.evaluate(here.estimate.moved(steps, system.landmarks, problem.observed.groups))
+        gain = 0.5 * float((system.landmarks.pull**2).sum() - steps.ravel() @ system.gradient)
+        decrease = gain / max(here.cost, _LEAST_COST)
+        if there.cost <= here.cost:
+            return there, max(damping * 0.1, _LEAST_DAMPING), decrease
+        if decrease <= _CONVERGED:
             break
-    system = _linearise(problem, states, points, errors)
-    normal, _, _ = _reduce(problem, system, 0.0)
-    return Adjustment(states, points, normal, errors, _weights(errors), cost, iterations)
+        damping *= 10.0
+    return here, damping, 0.0
 
 
-def _rows(camera: Index, count: int) -> tuple[Index, ...]:
-    return tuple(np.flatnonzero(camera == c) for c in range(count))
+def _solve(system: _Reduced, free: Index, damping: float) -> Array:
+    """Steps (C·S,) of the cameras' states; zero for those that are held."""
+    scale = 1.0 / np.sqrt(system.normal[free, free])
+    lower = system.normal[np.ix_(free, free)] * scale[:, None] * scale
+    np.fill_diagonal(lower, 1.0 + damping)
+    right = system.gradient[free] * scale
+    if len(system.normal) <= _MANY_STATES:
+        solution = scipy.linalg.cho_solve(
+            scipy.linalg.cho_factor(lower, lower=True, check_finite=False), right
+        )
+    else:
+        below = scipy.sparse.csc_array(np.tril(lower, -1))
+        whole = scipy.sparse.csc_array(below + below.T + scipy.sparse.diags_array(np.diag(lower)))
+        solution = scipy.sparse.linalg.spsolve(whole, right, permc_spec="MMD_AT_PLUS_A")
+    steps = np.zeros(len(system.gradient))
+    steps[free] = -scale * solution
+    return steps
 
 
-def _co_observations(seen: Observations) -> dict[tuple[int, int], tuple[Index, Index]]:
-    """For every ordered pair of cameras: the rows of `seen` where both observe the same point."""
-    order = np.argsort(seen.point, kind="stable")
-    count = np.bincount(seen.point)
-    first = np.concatenate([[0], np.cumsum(count)[:-1]])
-    left = np.repeat(np.arange(len(order)), count[seen.point[order]])
-    within = np.arange(len(left)) - np.repeat(
-        np.cumsum(count[seen.point[order]]) - count[seen.point[order]], count[seen.point[order]]
+def _result(problem: _Problem, here: _Evaluation, iterations: int) -> Adjustment:
+    """States, residuals, and the information that reweighted least squares has at the end."""
+    end, observed = problem.evaluate(here.estimate), problem.observed
+    points, planes = observed.split_landmarks(end.estimate.landmarks)
+    residuals, plane_residuals = observed.split_residuals(end.rows.residual.copy())
+    reweight(observed.kernels, *end.rows, _CAUCHY_SQUARED, 1.0)
+    normal = problem.reduce(end.estimate, end.rows, 0.0).normal
+    information = np.zeros_like(normal)
+    free = np.ix_(problem.free, problem.free)
+    information[free] = (np.tril(normal) + np.tril(normal, -1).T)[free]
+    states = zip(end.estimate.T_rig_camera, end.estimate.beside_pose, strict=True)
+    return Adjustment(
+        states=tuple(CameraState.from_columns(T, others) for T, others in states),
+        points=points,
+        planes=planes,
+        normal=information,
+        residuals=residuals,
+        plane_residuals=plane_residuals,
+        weights=_weights(residuals),
+        cost=end.cost,
+        iterations=iterations,
     )
-    right = order[first[seen.point[order[left]]] + within]
-    left = order[left]
-    key = seen.camera[left] * (seen.camera.max() + 1) + seen.camera[right]
-    by_key = np.argsort(key, kind="stable")
-    groups = np.split(by_key, np.flatnonzero(np.diff(key[by_key])) + 1)
-    return {
-        (int(seen.camera[left[g[0]]]), int(seen.camera[right[g[0]]])): (left[g], right[g]) for g in groups
-    }
 
 
-def _residuals(problem: _Problem, states: Sequence[CameraState], points: Array) -> Array:
-    errors = np.empty((len(problem.seen), 3))
-    for camera, state, rows in zip(problem.cameras, states, problem.rows, strict=True):
-        seen = problem.seen.select(rows)
-        errors[rows] = residuals(camera.color, camera.grid, state, points[seen.point], seen)
-    return errors
-
-
-def _weights(errors: Array) -> Array:
+def _weights(residuals: Array) -> Array:
     """Cauchy weights (M,2) of pixels and disparities."""
-    pixel = 1.0 / (1.0 + (errors[:, 0] ** 2 + errors[:, 1] ** 2) / _CAUCHY_SQUARED)
-    return np.column_stack([pixel, 1.0 / (1.0 + errors[:, 2] ** 2 / _CAUCHY_SQUARED)])
+    squares = np.column_stack([(residuals[:, :2] ** 2).sum(axis=1), residuals[:, 2] ** 2])
+    return np.asarray(1.0 / (1.0 + squares / _CAUCHY_SQUARED))
 
 
-def _cost(problem: _Problem, states: Sequence[CameraState], errors: Array) -> float:
-    if not np.isfinite(errors).all():
-        return np.inf
-    pixel = np.log1p((errors[:, 0] ** 2 + errors[:, 1] ** 2) / _CAUCHY_SQUARED).sum()
-    disparity = np.log1p(errors[:, 2] ** 2 / _CAUCHY_SQUARED).sum()
-    cost = 0.5 * _CAUCHY_SQUARED * float(pixel + disparity)
-    for camera, state in zip(problem.cameras, states, strict=True):
-        pose = _pose_prior(camera, state)
-        cost += 0.5 * _CAUCHY_SQUARED_POSE * float(np.log1p(pose @ pose / _CAUCHY_SQUARED_POSE))
-        cost += 0.5 * float(((state.bias / camera.bias_sigma) ** 2).sum())
-        cost += 0.5 * float(((state.intrinsics / camera.intrinsics_sigma) ** 2).sum())
-    return cost
+def _start(cameras: Sequence[AdjustedCamera], points: Array, planes: Array) -> _Estimate:
+    down = [
+        camera.start.T_rig_camera[:3, :3] @ camera.gravity for camera in cameras if camera.gravity is not None
+    ]
+    gravity = np.mean(down, axis=0, keepdims=True) if down else np.empty((0, 3))
+    return _Estimate(
+        np.array([camera.start.T_rig_camera for camera in cameras]),
+        np.array([camera.start.beside_pose() for camera in cameras]),
+        np.concatenate([points, planes, gravity]),
+    )
 
 
-def _pose_prior(camera: AdjustedCamera, state: CameraState) -> Array:
-    """Whitened difference (6,) between the drawing's pose and the state's; zero without a drawing."""
-    if camera.T_prior is None or camera.pose_sigma is None:
-        return np.zeros(6)
-    return se3_log(inverse(camera.T_prior) @ state.T_rig_camera) / camera.pose_sigma
+def _gravity(cameras: Sequence[AdjustedCamera]) -> GravityObservations:
+    felt = [
+        (c, camera.gravity, camera.gravity_sigma)
+        for c, camera in enumerate(cameras)
+        if camera.gravity is not None
+    ]
+    return GravityObservations(
+        np.array([c for c, _, _ in felt], dtype=np.intp),
+        np.array([direction for _, direction, _ in felt]).reshape(-1, 3),
+        np.array([sigma for _, _, sigma in felt]),
+    )
 
 
-def _linearise(problem: _Problem, states: Sequence[CameraState], points: Array, errors: Array) -> _Linearised:
-    size = problem.state_size
-    root = np.sqrt(_weights(errors))[:, (0, 0, 1)]
-    by_state, by_point = np.empty((len(errors), 3, size)), np.empty((len(errors), 3, 3))
-    for camera, state, rows in zip(problem.cameras, states, problem.rows, strict=True):
-        seen = problem.seen.select(rows)
-        by_state[rows], by_point[rows] = jacobians(camera.color, camera.grid, state, points[seen.point], seen)
-        if camera.fixed_pose:
-            by_state[rows, :, POSE] = 0.0
-    by_state, by_point, weighted = by_state * root[..., None], by_point * root[..., None], errors * root
-
-    V, point_gradient = np.zeros((problem.point_count, 3, 3)), np.zeros((problem.point_count, 3))
-    np.add.at(V, problem.seen.point, np.einsum("mki,mkj->mij", by_point, by_point))
-    np.add.at(point_gradient, problem.seen.point, np.einsum("mki,mk->mi", by_point, weighted))
-    U, camera_gradient = np.zeros((len(states), size, size)), np.zeros((len(states), size))
-    for c, (camera, state, rows) in enumerate(zip(problem.cameras, states, problem.rows, strict=True)):
-        J = by_state[rows].reshape(-1, size)
-        information, gradient = _prior(camera, state)
-        U[c], camera_gradient[c] = J.T @ J + information, J.T @ weighted[rows].ravel() + gradient
-    return _Linearised(U, V, np.einsum("mks,mki->msi", by_state, by_point), camera_gradient, point_gradient)
-
-
-def _prior(camera: AdjustedCamera, state: CameraState) -> tuple[Array, Array]:
-    """Information (S,S) and gradient (S,) of one camera's priors."""
-    pose = _pose_prior(camera, state)
-    weight = 0.0 if camera.T_prior is None else 1.0 / (1.0 + pose @ pose / _CAUCHY_SQUARED_POSE)
-    sigma = np.ones(6) if camera.pose_sigma is None else camera.pose_sigma
-    if camera.fixed_pose:
-        weight = 0.0
-    value = np.concatenate([state.bias / camera.bias_sigma, state.intrinsics / camera.intrinsics_sigma])
-    others = np.concatenate([camera.bias_sigma, camera.intrinsics_sigma])
-    information = np.diag(np.concatenate([weight / sigma**2, 1.0 / others**2]))
-    return information, np.concatenate([weight * pose / sigma, value / others])
-
-
-def _reduce(problem: _Problem, system: _Linearised, damping: float) -> tuple[Array, Array, Array]:
-    """Eliminate the points: the reduced normal matrix and gradient, and the inverse (P,3,3) of V."""
-    size, count = problem.state_size, len(problem.cameras)
-    diagonal = np.einsum("pii->pi", system.V)
-    V_inverse = np.linalg.inv(system.V + (damping * diagonal + 1e-12)[:, :, None] * np.eye(3))
-    point = problem.seen.point
-    through = np.einsum("msi,mij->msj", system.W, V_inverse[point])
-    normal = np.zeros((count, size, count, size))
-    for c in range(count):
-        normal[c, :, c, :] = system.U[c] + damping * np.diag(np.diag(system.U[c]))
-    for (c, d), (left, right) in problem.pairs.items():
-        normal[c, :, d, :] -= np.tensordot(through[left], system.W[right], axes=([0, 2], [0, 2]))
-    gradient = system.camera_gradient.copy()
-    np.add.at(gradient, problem.seen.camera, -np.einsum("msi,mi->ms", through, system.point_gradient[point]))
-    return normal.reshape(count * size, count * size), gradient.ravel(), V_inverse
-
-
-def _step(
-    problem: _Problem, states: Sequence[CameraState], points: Array, system: _Linearised, damping: float
-) -> tuple[tuple[CameraState, ...], Array]:
-    normal, gradient, V_inverse = _reduce(problem, system, damping)
-    free = np.diag(normal) > 0.0
-    delta = np.zeros(len(gradient))
-    delta[free] = -np.linalg.solve(normal[np.ix_(free, free)], gradient[free])
-    by_camera = delta.reshape(len(states), problem.state_size)
-    pull = system.point_gradient.copy()
-    np.add.at(pull, problem.seen.point, np.einsum("msi,ms->mi", system.W, by_camera[problem.seen.camera]))
-    moved = tuple(_moved(state, change) for state, change in zip(states, by_camera, strict=True))
-    return moved, points - np.einsum("pij,pj->pi", V_inverse, pull)
-
-
-def _moved(state: CameraState, delta: Array) -> CameraState:
-    terms = len(state.bias)
-    return CameraState(
-        state.T_rig_camera @ se3_exp(delta[POSE]),
-        state.bias + delta[6 : 6 + terms],
-        state.intrinsics + delta[6 + terms :],
+def _priors(cameras: Sequence[AdjustedCamera]) -> CameraPriors:
+    poses = [prior_pose(camera.T_prior, camera.pose_sigma) for camera in cameras]
+    expected = [
+        np.zeros(len(camera.sigma_beside_pose()))
+        if camera.expected is None
+        else camera.expected.beside_pose()
+        for camera in cameras
+    ]
+    return CameraPriors(
+        np.array([T for T, _ in poses]),
+        np.array([weight for _, weight in poses]),
+        np.array(expected),
+        np.array([weights_of(camera.sigma_beside_pose()) for camera in cameras]),
     )

@@ -54,7 +54,7 @@ def observed_noise(seen: Observations, residuals: Array, point_count: int) -> No
     count = 2 * len(residuals)
     left = max(count - 2 * point_count, 1)  # each point takes two coordinates for itself
     scatter = float(np.median(np.abs(residuals[:, :2])))
-    pixel_error = residuals[:, :2] * seen.pixel_sigma[:, None]
+    pixel_error = seen.pixel_error(residuals[:, :2])
     disparity_error = residuals[:, 2:] * seen.disparity_sigma[:, None]
     inlier = np.asarray((np.abs(residuals) < _OUTLIER_SIGMAS).all(axis=1))
     with_depth = np.asarray(inlier & np.isfinite(seen.disparity))

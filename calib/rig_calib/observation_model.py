@@ -1,53 +1,70 @@
-"""What a camera should have measured of a point, and the derivatives of the difference.
+"""What a camera should have measured of a landmark, and the derivatives of the difference.
 
-A camera's state is its pose T_rig_camera, its depth bias (the coefficients of `DepthCorrection`) and its
-colour intrinsics (relative focal length, principal point in pixels). An observation is a keypoint's pixel
-and, where there is one, the disparity there.
+A camera's state is its pose T_rig_camera and what is wrong with its factory model: its depth bias (the
+coefficients of `DepthCorrection`), its colour intrinsics, the pose of its depth grid and that one's
+intrinsics. A landmark is a point, observed by its pixel and the disparity there, or a plane, observed by
+disparities.
 """
 
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import numpy.typing as npt
 
 from rig_calib.depth_model import DepthGrid, depth_basis
-from rig_calib.projection import from_pixels, project, project_jacobian
+from rig_calib.observation_kernels import Cameras, PlaneRows, PointRows
+from rig_calib.projection import distortion_inverse, from_pixels, undistort_pixels
 from rig_protocol.camera import Intrinsics
-from rig_protocol.poses import Pose, hat, inverse, transform_points
+from rig_protocol.poses import Pose, hat
 
 Array = npt.NDArray[np.float64]
 Index = npt.NDArray[np.intp]
 
 POSE = slice(0, 6)
 """Where the pose stands in a camera's state: rotation vector (rad), translation (m), T · Exp(δ)."""
-INTRINSIC_TERMS = 3
-_MIN_DEPTH_M = 0.05
-
-# A point without any disparity still lies in the room: its inverse depth is 0.5 ± 0.4 per metre.
-_VAGUE_INVERSE_DEPTH, _VAGUE_INVERSE_DEPTH_SIGMA = 0.5, 0.4
+INTRINSIC_TERMS, GRID_POSE_TERMS, GRID_INTRINSIC_TERMS = 4, 6, 3
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CameraState:
-    """What the adjustment estimates of one camera. `intrinsics`: (log focal scale, Δcx, Δcy)."""
+    """What the adjustment estimates of one camera; zeros are the factory model.
+
+    `bias` (B,): coefficients of `DepthCorrection`. `intrinsics`: (log focal scale, Δcx, Δcy, Δk1) of the
+    colour camera. `grid_pose`: rotation vector and translation on the right of T_color_grid.
+    `grid_intrinsics`: (log focal scale, Δcx, Δcy) of the grid.
+    """
 
     T_rig_camera: Pose
     bias: Array
-    intrinsics: Array
+    intrinsics: Array = field(default_factory=lambda: np.zeros(INTRINSIC_TERMS))
+    grid_pose: Array = field(default_factory=lambda: np.zeros(GRID_POSE_TERMS))
+    grid_intrinsics: Array = field(default_factory=lambda: np.zeros(GRID_INTRINSIC_TERMS))
+
+    def beside_pose(self) -> Array:
+        """All but the pose (S−6,), in the order of the state's columns."""
+        return np.concatenate([self.bias, self.intrinsics, self.grid_pose, self.grid_intrinsics])
+
+    @classmethod
+    def from_columns(cls, T_rig_camera: Pose, beside_pose: Array) -> "CameraState":
+        """The state from a pose and `beside_pose` (S−6,)."""
+        ends = np.cumsum([GRID_INTRINSIC_TERMS, GRID_POSE_TERMS, INTRINSIC_TERMS])[::-1]
+        return cls(T_rig_camera, *(part.copy() for part in np.split(beside_pose, len(beside_pose) - ends)))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Observations:
     """M observations; `camera` (M,) and `point` (M,) index the problem's cameras and points.
 
-    `pixels` (M,2) with `pixel_sigma` (M,); `disparity` (M,), NaN = none, with its `slope` (M,2) around
-    `grid_pixels` (M,2) and `disparity_sigma` (M,).
+    The residual of `pixels` (M,2) is `pixel_whitener` (M,2,2) times the difference in pixels: I/σ for a
+    keypoint, of rank one for an edge, zero for none. `disparity` (M,), NaN = none, with its `slope` (M,2)
+    around `grid_pixels` (M,2) and `disparity_sigma` (M,).
     """
 
     camera: Index
     point: Index
     pixels: Array
-    pixel_sigma: Array
+    pixel_whitener: Array
     disparity: Array
     slope: Array
     grid_pixels: Array
@@ -61,87 +78,172 @@ class Observations:
         """The observations that a mask or an index names."""
         return Observations(*(getattr(self, name)[keep] for name in self.__dataclass_fields__))
 
+    def pixel_error(self, residuals: Array) -> Array:
+        """Pixels (M,2) that whitened residuals (M,2) stand for; zero across what was not measured."""
+        W = self.pixel_whitener
+        size = np.einsum("mij,mij->m", W, W)
+        determinant = W[:, 0, 0] * W[:, 1, 1] - W[:, 0, 1] * W[:, 1, 0]
+        full = np.abs(determinant) > 1e-6 * size
+        adjugate = W[:, (0, 1), (0, 1)].sum(axis=1)[:, None, None] * np.eye(2) - W
+        pseudo_inverse = np.where(full[:, None, None], adjugate, W.transpose(0, 2, 1))
+        by = np.where(full, determinant, np.where(size > 0.0, size, 1.0))
+        return np.asarray(np.einsum("mij,mj->mi", pseudo_inverse, residuals) / by[:, None])
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class PlaneObservations:
+    """M disparities that cameras measured of shared planes at `grid_pixels` (M,2), thinned to be independent.
+
+    `camera` (M,) and `plane` (M,) index the problem's cameras and planes.
+    """
+
+    camera: Index
+    plane: Index
+    grid_pixels: Array
+    disparity: Array
+    disparity_sigma: Array
+
+    def __len__(self) -> int:
+        """How many observations there are."""
+        return len(self.camera)
+
+    def select(self, keep: npt.NDArray[np.bool_] | Index) -> "PlaneObservations":
+        """The observations that a mask or an index names."""
+        return PlaneObservations(*(getattr(self, name)[keep] for name in self.__dataclass_fields__))
+
+    @classmethod
+    def none(cls) -> "PlaneObservations":
+        """No observations."""
+        nothing = np.empty(0, dtype=np.intp)
+        return cls(nothing, nothing, np.empty((0, 2)), np.empty(0), np.empty(0))
+
+
+def isotropic_whitener(sigma: Array) -> Array:
+    """Whiteners (M,2,2) of pixels known alike in all directions; `sigma` (M,) in pixels."""
+    return np.eye(2) / np.asarray(sigma)[:, None, None]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class FactoryModels:
+    """The models of C cameras before anything is adjusted; intrinsics (C,9) as `Cameras` has them."""
+
+    color: Array
+    grid: Array
+    T_color_grid: Array
+    raw_model: Array
+    grids: tuple[DepthGrid, ...]
+    bias_terms: int
+
+    @property
+    def state_size(self) -> int:
+        """Columns of a camera's state."""
+        return 6 + self.bias_terms + INTRINSIC_TERMS + GRID_POSE_TERMS + GRID_INTRINSIC_TERMS
+
+    @classmethod
+    def of(cls, color: Sequence[Intrinsics], grids: Sequence[DepthGrid], bias_terms: int) -> "FactoryModels":
+        """From one colour camera and one grid a camera."""
+        return cls(
+            color=np.array([_numbers(intrinsics) for intrinsics in color]),
+            grid=np.array([_numbers(grid.intrinsics) for grid in grids]),
+            T_color_grid=np.array([grid.T_color_grid for grid in grids], dtype=np.float64),
+            raw_model=np.array([(grid.raw_model.numerator_m, grid.raw_model.offset) for grid in grids]),
+            grids=tuple(grids),
+            bias_terms=bias_terms,
+        )
+
+    def with_states(self, T_rig_camera: Array, beside_pose: Array) -> Cameras:
+        """The cameras with poses (C,4,4) and states beside them (C,S−6) applied."""
+        bias, intrinsics, grid_pose, grid_intrinsics = np.split(
+            beside_pose, self.bias_terms + np.cumsum([0, INTRINSIC_TERMS, GRID_POSE_TERMS]), axis=1
+        )
+        color, grid = self.color.copy(), self.grid.copy()
+        for adjusted, change in ((color, intrinsics), (grid, grid_intrinsics)):
+            adjusted[:, :2] *= np.exp(change[:, :1])
+            adjusted[:, 2 : 1 + change.shape[1]] += change[:, 1:]
+        turn, turn_jacobian = _small_turns(grid_pose[:, :3])
+        R, t = self.T_color_grid[:, :3, :3], self.T_color_grid[:, :3, 3]
+        return Cameras(
+            R_rig_camera=np.ascontiguousarray(T_rig_camera[:, :3, :3]),
+            t_rig_camera=np.ascontiguousarray(T_rig_camera[:, :3, 3]),
+            color=color,
+            R_color_grid=R @ turn,
+            t_color_grid=t + (R @ grid_pose[:, 3:, None])[..., 0],
+            grid=grid,
+            raw_model=self.raw_model,
+            bias=np.ascontiguousarray(bias),
+            grid_turn=turn,
+            grid_turn_jacobian=turn_jacobian,
+        )
+
+    def point_rows(self, seen: Observations) -> PointRows:
+        """Observations as the compiled loops take them."""
+        known = np.isfinite(seen.disparity)
+        grid_pixels = np.where(known[:, None], seen.grid_pixels, 0.0)
+        return PointRows(
+            camera=seen.camera,
+            point=seen.point,
+            pixels=seen.pixels,
+            whitener=np.ascontiguousarray(seen.pixel_whitener),
+            disparity=np.where(known, seen.disparity, 0.0),
+            slope=np.where(known[:, None], seen.slope, 0.0),
+            grid_pixels=grid_pixels,
+            disparity_weight=np.divide(1.0, seen.disparity_sigma, out=np.zeros(len(seen)), where=known),
+            basis=self._basis(seen.camera, grid_pixels),
+        )
+
+    def plane_rows(self, seen: PlaneObservations) -> PlaneRows:
+        """Observations as the compiled loops take them."""
+        distorted, rays, by_distorted = (
+            np.empty((len(seen), 2)),
+            np.empty((len(seen), 2)),
+            np.empty((len(seen), 2, 2)),
+        )
+        for c in np.unique(seen.camera):
+            here, intrinsics = seen.camera == c, self.grids[c].intrinsics
+            distorted[here] = from_pixels(intrinsics, seen.grid_pixels[here])
+            rays[here] = undistort_pixels(intrinsics, seen.grid_pixels[here])
+            by_distorted[here] = distortion_inverse(intrinsics, rays[here])
+        return PlaneRows(
+            camera=seen.camera,
+            plane=seen.plane,
+            disparity=seen.disparity,
+            disparity_weight=1.0 / seen.disparity_sigma,
+            basis=self._basis(seen.camera, seen.grid_pixels),
+            grid_pixels=seen.grid_pixels,
+            distorted=distorted,
+            rays=rays,
+            ray_by_distorted=by_distorted,
+        )
+
+    def _basis(self, camera: Index, grid_pixels: Array) -> Array:
+        """Basis (M,B) of the depth bias at grid pixels (M,2)."""
+        fx, fy, cx, cy = self.grid[camera, :4].T
+        x, y = (grid_pixels[:, 0] - cx) / fx, (grid_pixels[:, 1] - cy) / fy
+        return depth_basis(x, y, self.bias_terms)
+
 
 def adjusted_intrinsics(color: Intrinsics, state: Array) -> Intrinsics:
     """Colour intrinsics with a camera's intrinsic state applied."""
     scale = float(np.exp(state[0]))
+    k1, k2, p1, p2, k3 = color.dist
     return replace(
         color,
         fx=color.fx * scale,
         fy=color.fy * scale,
         cx=color.cx + float(state[1]),
         cy=color.cy + float(state[2]),
+        dist=(k1 + float(state[3]), k2, p1, p2, k3),
     )
 
 
-def residuals(
-    color: Intrinsics, grid: DepthGrid, state: CameraState, points: Array, seen: Observations
-) -> Array:
-    """Whitened residuals (M,3) of one camera: column, row, disparity (0 where there is none).
-
-    Infinite for a point that is not in front of the camera.
-    `points` (M,3), rig frame, are those that `seen` observes, row by row.
-    """
-    in_camera = transform_points(inverse(state.T_rig_camera), points)
-    out = np.zeros((len(seen), 3))
-    out[:, :2] = project(adjusted_intrinsics(color, state.intrinsics), in_camera) - seen.pixels
-    out[:, :2] /= seen.pixel_sigma[:, None]
-    known = np.isfinite(seen.disparity)
-    in_grid = transform_points(inverse(grid.T_color_grid), in_camera[known])
-    measured = seen.disparity[known] + np.einsum(
-        "mk,mk->m", seen.slope[known], project(grid.intrinsics, in_grid) - seen.grid_pixels[known]
-    )
-    factor = 1.0 + _bias_basis(grid, seen.grid_pixels[known], len(state.bias)) @ state.bias
-    predicted = grid.raw_model.offset - grid.raw_model.numerator_m * factor / in_grid[:, 2]
-    out[known, 2] = (predicted - measured) / seen.disparity_sigma[known]
-    out[in_camera[:, 2] < _MIN_DEPTH_M] = np.inf
-    return out
+def _numbers(intrinsics: Intrinsics) -> tuple[float, ...]:
+    return (intrinsics.fx, intrinsics.fy, intrinsics.cx, intrinsics.cy, *intrinsics.dist)
 
 
-def jacobians(
-    color: Intrinsics, grid: DepthGrid, state: CameraState, points: Array, seen: Observations
-) -> tuple[Array, Array]:
-    """Derivatives of `residuals`: by the camera's state (M,3,S) and by the points (M,3,3)."""
-    in_camera = transform_points(inverse(state.T_rig_camera), points)
-    terms = len(state.bias)
-    by_position = np.zeros((len(seen), 3, 3))  # in the camera frame
-    by_state = np.zeros((len(seen), 3, 6 + terms + INTRINSIC_TERMS))
-    intrinsics = adjusted_intrinsics(color, state.intrinsics)
-    weight = 1.0 / seen.pixel_sigma
-    by_position[:, :2] = project_jacobian(intrinsics, in_camera) * weight[:, None, None]
-    centre = (intrinsics.cx, intrinsics.cy)
-    by_state[:, :2, 6 + terms] = (project(intrinsics, in_camera) - centre) * weight[:, None]
-    by_state[:, 0, 7 + terms] = by_state[:, 1, 8 + terms] = weight
-
-    known = np.isfinite(seen.disparity)
-    by_position[known, 2], by_state[known, 2, 6 : 6 + terms] = _disparity_jacobian(
-        grid, state.bias, in_camera[known], seen.select(known)
-    )
-    by_state[:, :, 0:3] = by_position @ hat(in_camera)
-    by_state[:, :, 3:6] = -by_position
-    return by_state, by_position @ state.T_rig_camera[:3, :3].T
-
-
-def vague_disparity(grid: DepthGrid) -> tuple[float, float]:
-    """Disparity and standard deviation that stand for "somewhere in the room"."""
-    numerator, offset = grid.raw_model.numerator_m, grid.raw_model.offset
-    return offset - numerator * _VAGUE_INVERSE_DEPTH, numerator * _VAGUE_INVERSE_DEPTH_SIGMA
-
-
-def _disparity_jacobian(
-    grid: DepthGrid, bias: Array, in_camera: Array, seen: Observations
-) -> tuple[Array, Array]:
-    """Of the whitened disparity residual: by the point in the camera frame (M,3) and by the bias (M,B)."""
-    T_grid_color = inverse(grid.T_color_grid)
-    in_grid = transform_points(T_grid_color, in_camera)
-    basis = _bias_basis(grid, seen.grid_pixels, len(bias))
-    per_depth = grid.raw_model.numerator_m / in_grid[:, 2]
-    by_grid = -np.einsum("mk,mki->mi", seen.slope, project_jacobian(grid.intrinsics, in_grid))
-    by_grid[:, 2] += per_depth * (1.0 + basis @ bias) / in_grid[:, 2]
-    weight = 1.0 / seen.disparity_sigma[:, None]
-    return by_grid @ T_grid_color[:3, :3] * weight, -basis * per_depth[:, None] * weight
-
-
-def _bias_basis(grid: DepthGrid, grid_pixels: Array, terms: int) -> Array:
-    x, y = from_pixels(grid.intrinsics, grid_pixels).T
-    return depth_basis(x, y, terms) if terms else np.zeros((len(grid_pixels), 0))
+def _small_turns(phi: Array) -> tuple[Array, Array]:
+    """Exp (C,3,3) and right Jacobian (C,3,3) of rotation vectors (C,3) of some degrees, to fourth order."""
+    K = hat(phi)
+    square = K @ K
+    eye, cube, fourth = np.eye(3), square @ K, square @ square
+    turn = eye + K + square / 2.0 + cube / 6.0 + fourth / 24.0
+    return turn, eye - K / 2.0 + square / 6.0 - cube / 24.0 + fourth / 120.0

@@ -56,6 +56,11 @@ def undistort_pixels(intrinsics: Intrinsics, pixels: Array) -> Array:
     return normalised
 
 
+def distortion_inverse(intrinsics: Intrinsics, normalised: Array) -> Array:
+    """Derivative (N,2,2) of undistorted normalised coordinates (N,2), given, by the distorted ones."""
+    return np.asarray(np.linalg.inv(_distort_jacobian(intrinsics, normalised)))
+
+
 @lru_cache(maxsize=16)  # one a camera of the rig and some to spare; 5 MB each
 def pixel_rays(intrinsics: Intrinsics) -> Array:
     """Normalised coordinates (H,W,2) of the ray through every pixel; read-only."""

@@ -8,7 +8,7 @@ import numpy.typing as npt
 
 from rig_calib.matching import Matches
 from rig_calib.noise import NoiseModel
-from rig_calib.observation_model import Observations
+from rig_calib.observation_model import Observations, isotropic_whitener
 from rig_calib.observed_camera import ObservedCamera
 from rig_protocol.poses import Pose, transform_points
 
@@ -92,13 +92,14 @@ def _observations(
     scale_px = observed.gather(lambda c: c.keypoints.scale_px, 1)[:, 0]
     lookup_sigma = observed.gather(lambda c: c.depth.sigma, 1)[:, 0]
     everything = np.ones(len(point), dtype=bool)
+    sigma = _by_camera(
+        observed.camera, everything, lambda r: noise.keypoint_sigma(pixel_sigma, pixels[r], scale_px[r])
+    )
     return Observations(
         camera=observed.camera,
         point=point,
         pixels=pixels,
-        pixel_sigma=_by_camera(
-            observed.camera, everything, lambda r: noise.keypoint_sigma(pixel_sigma, pixels[r], scale_px[r])
-        ),
+        pixel_whitener=isotropic_whitener(sigma),
         disparity=observed.gather(lambda c: c.depth.disparity, 1)[:, 0],
         slope=observed.gather(lambda c: c.depth.slope, 2),
         grid_pixels=grid_pixels,

@@ -1,4 +1,4 @@
-"""Decoding loops compiled to machine code, on the PC only: the one module of the protocol that needs Numba.
+"""Decoding loops compiled to machine code, on the PC only: the codecs' one module that needs Numba.
 
 Every loop runs without the interpreter's lock and stays within its arrays whatever the bytes say. The loops
 over a row are written so that the compiler turns them into vector instructions: eight-bit sums of eight-bit
@@ -6,18 +6,12 @@ numbers, no element that waits for the one before. `pyramid.py` and `depth.py` a
 explain the layout.
 """
 
-from collections.abc import Callable
-from typing import ParamSpec, TypeVar
-
-import numba
 import numpy as np
 import numpy.typing as npt
 from numba import int64, types, uint8, uint16, void
 
 from rig_protocol.codecs.pyramid import LEVELS, MIDDLE
-
-P = ParamSpec("P")
-R = TypeVar("R")
+from rig_protocol.compiled import compiled, inlined
 
 U8 = npt.NDArray[np.uint8]
 U16 = npt.NDArray[np.uint16]
@@ -41,26 +35,7 @@ _STREAM_IMAGE = types.Array(uint8, 2, "C", readonly=True)
 _COUNTS = types.Tuple((int64, int64))  # type: ignore[no-untyped-call]  # Numba leaves it so
 
 
-def _compiled(signature: object) -> Callable[[Callable[P, R]], Callable[P, R]]:
-    """Compile now, from the cache where there is one, so that no frame waits for it."""
-
-    def compile_function(function: Callable[P, R]) -> Callable[P, R]:
-        try:
-            compiled: Callable[P, R] = numba.njit(signature, nogil=True, cache=True)(function)
-        except (RuntimeError, OSError):  # neither the installation nor the user's cache folder takes it
-            compiled = numba.njit(signature, nogil=True)(function)
-        return compiled
-
-    return compile_function
-
-
-def _inlined(function: Callable[P, R]) -> Callable[P, R]:
-    """Part of the compiled functions that call it."""
-    inlined: Callable[P, R] = numba.njit(nogil=True)(function)
-    return inlined
-
-
-@_inlined
+@inlined
 def _restore_row(a: U8, b: U8, c: U8, d: U8, residual: U8, offset: np.uint8, row: U8) -> None:
     """Pixels from their four neighbours: the mean of the middle two, rounded up, plus what it missed."""
     for x in range(row.size):
@@ -70,20 +45,20 @@ def _restore_row(a: U8, b: U8, c: U8, d: U8, residual: U8, offset: np.uint8, row
         row[x] = np.uint8(mean + residual[x] + offset)
 
 
-@_inlined
+@inlined
 def _interleave(even: U8, odd: U8, row: U8) -> None:
     for x in range(odd.size):
         row[2 * x] = even[x]
         row[2 * x + 1] = odd[x]
 
 
-@_inlined
+@inlined
 def _copy_row(source: U8, row: U8) -> None:
     for x in range(row.size):
         row[x] = source[x]
 
 
-@_inlined
+@inlined
 def _repeat_edges(plane: U8) -> None:
     """Fill the last row and column with those before them."""
     height, width = plane.shape[0] - 1, plane.shape[1] - 1
@@ -92,7 +67,7 @@ def _repeat_edges(plane: U8) -> None:
     _copy_row(plane[height - 1], plane[height])
 
 
-@_inlined
+@inlined
 def _refine(corners: U8, at_centres: U8, at_columns: U8, at_rows: U8, offset: np.uint8, finer: U8) -> None:
     """Fill a grid from every second pixel (H + 1, W + 1; edges repeated) and the residuals of the others.
 
@@ -115,7 +90,7 @@ def _refine(corners: U8, at_centres: U8, at_columns: U8, at_rows: U8, offset: np
         above, centres = centres, above
 
 
-@_inlined
+@inlined
 def _restore_coarsest(residuals: U8, height: int, width: int) -> U8:
     """Each pixel from the one before."""
     plane = np.empty((height + 1, width + 1), np.uint8)
@@ -128,7 +103,7 @@ def _restore_coarsest(residuals: U8, height: int, width: int) -> U8:
     return plane
 
 
-@_inlined
+@inlined
 def _restore_plane(residuals: U8, height: int, width: int) -> U8:
     """A plane of whole blocks, with its last row and column repeated (H + 1, W + 1)."""
     height, width = height >> _LEVELS, width >> _LEVELS
@@ -144,7 +119,7 @@ def _restore_plane(residuals: U8, height: int, width: int) -> U8:
     return plane
 
 
-@_compiled(void(_STREAM_IMAGE, uint8[:, :, ::1]))
+@compiled(void(_STREAM_IMAGE, uint8[:, :, ::1]))
 def restore_planes(residuals: U8, planes: U8) -> None:
     """Fill planes (N, H, W) of whole blocks from their residuals (N, H·W)."""
     for index in range(len(planes)):
@@ -153,7 +128,7 @@ def restore_planes(residuals: U8, planes: U8) -> None:
             _copy_row(plane[y], planes[index, y])
 
 
-@_compiled(void(_STREAM, uint8[:, ::1]))
+@compiled(void(_STREAM, uint8[:, ::1]))
 def restore_mosaic(residuals: U8, mosaic: U8) -> None:
     """Fill a mosaic of whole blocks (H, W) from its residuals (H·W).
 
@@ -170,7 +145,7 @@ def restore_mosaic(residuals: U8, mosaic: U8) -> None:
     _refine(green, centres, red, blue, _MIDDLE, mosaic)
 
 
-@_inlined
+@inlined
 def _unpack_codes(codes: U8, steps: U64, escaped: U8) -> None:
     """Steps 0, −1, 1 of the codes 0, 1, 2, four 16-bit ones in a word; code 3 gives 0 and a set bit."""
     four = np.uint64(0x0001_0001_0001_0001)
@@ -184,7 +159,7 @@ def _unpack_codes(codes: U8, steps: U64, escaped: U8) -> None:
         steps[x] = (high & ~low) | ((minus_one << np.uint64(16)) - minus_one)
 
 
-@_inlined
+@inlined
 def _unpack_escapes(escapes: U8) -> U16:
     """Steps of zigzag − 3 in low bytes, high bytes."""
     steps = np.empty(escapes.shape[1], np.uint16)
@@ -194,7 +169,7 @@ def _unpack_escapes(escapes: U8) -> U16:
     return steps
 
 
-@_inlined
+@inlined
 def _insert_escapes(escaped: U8, escapes: U16, used: int, steps: U16) -> int:
     """Put escaped steps in their places; returns how many escapes the surface has asked for.
 
@@ -212,7 +187,7 @@ def _insert_escapes(escaped: U8, escapes: U16, used: int, steps: U16) -> int:
     return used
 
 
-@_inlined
+@inlined
 def _add_row(steps: U16, mask: U8, bit: np.uint8, none: np.uint16, last: U16, row: U16) -> np.uint16:
     """Each column's next value where there is a measurement, and the largest; `last` are those before."""
     largest = np.uint16(0)
@@ -223,7 +198,7 @@ def _add_row(steps: U16, mask: U8, bit: np.uint8, none: np.uint16, last: U16, ro
     return largest
 
 
-@_compiled(_COUNTS(_STREAM_IMAGE, _STREAM_IMAGE, _STREAM_IMAGE, uint16, uint16[:, ::1]))
+@compiled(_COUNTS(_STREAM_IMAGE, _STREAM_IMAGE, _STREAM_IMAGE, uint16, uint16[:, ::1]))
 def restore_surface(mask: U8, codes: U8, escapes: U8, none: np.uint16, surface: U16) -> tuple[int, int]:
     """Fill `surface` from its mask, 2-bit codes and escapes (low bytes, high bytes).
 
