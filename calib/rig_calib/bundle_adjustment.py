@@ -13,7 +13,6 @@ import numpy.typing as npt
 import scipy.linalg
 import scipy.sparse
 import scipy.sparse.linalg
-from scipy.spatial.transform import Rotation
 
 from rig_calib.camera_priors import CameraPriors, prior_pose, weights_of
 from rig_calib.depth_model import DepthGrid
@@ -27,6 +26,7 @@ from rig_calib.observation_model import (
     Observations,
     PlaneObservations,
 )
+from rig_calib.rotations import rotation_matrices
 from rig_protocol.camera import Intrinsics
 from rig_protocol.poses import Pose
 
@@ -39,8 +39,7 @@ _CAUCHY_SQUARED = 2.385**2
 _LEAST_CURVATURE = 0.2  # beyond the kernel's bend its curvature is negative
 _NEAR = 0.003  # relative decrease of the cost to be expected
 _MAX_ITERATIONS = 40
-_CONVERGED = 1e-6
-_LEAST_COST = 1e-12
+_CONVERGED = 1e-3  # the decrease expected; one standard deviation costs a half
 _FIRST_DAMPING, _LEAST_DAMPING, _MAX_DAMPING = 1e-6, 1e-12, 1e8
 # From here on, 40 cameras or so, a ring is solved faster as a sparse system.
 _MANY_STATES = 1000
@@ -112,10 +111,10 @@ def adjust(
     seen_planes = PlaneObservations.none() if seen_planes is None else seen_planes
     problem = _Problem.of(cameras, LandmarkCounts(len(points), len(planes)), seen, seen_planes)
     here = problem.evaluate(_start(cameras, points, planes))
-    damping, decrease, iterations = _FIRST_DAMPING, 1.0, 0
-    while decrease > _CONVERGED and iterations < _MAX_ITERATIONS:
+    damping, gain, iterations = _FIRST_DAMPING, np.inf, 0
+    while gain > _CONVERGED and iterations < _MAX_ITERATIONS:
         iterations += 1
-        here, damping, decrease = _descend(problem, here, damping, decrease < _NEAR)
+        here, damping, gain = _descend(problem, here, damping, near=gain < _NEAR * here.cost)
     return _result(problem, here, iterations)
 
 
@@ -133,7 +132,7 @@ class _Estimate:
         landmark_steps(groups.camera, groups.first_group, *landmarks, by_camera, by_landmark)
         R = self.T_rig_camera[:, :3, :3]
         poses = self.T_rig_camera.copy()
-        poses[:, :3, :3] = R @ Rotation.from_rotvec(by_camera[:, :3]).as_matrix()
+        poses[:, :3, :3] = R @ rotation_matrices(by_camera[:, :3])
         poses[:, :3, 3] += (R @ by_camera[:, 3:6, None])[..., 0]
         return _Estimate(poses, self.beside_pose + by_camera[:, 6:], self.landmarks + by_landmark)
 
@@ -204,7 +203,7 @@ class _Problem:
 def _descend(
     problem: _Problem, here: _Evaluation, damping: float, near: bool
 ) -> tuple[_Evaluation, float, float]:
-    """One step downhill: where it leads, the next one's damping, and the share of the cost expected of it.
+    """One step downhill: where it leads, the next one's damping, and the decrease of the cost expected of it.
 
     Far from the minimum reweighted least squares is safe; near it, the kernel's own curvature is fast. Turns
     the rows of `here` into weighted ones.
@@ -215,10 +214,9 @@ def _descend(
         steps = _solve(system, problem.free, damping)
         there = problem.evaluate(here.estimate.moved(steps, system.landmarks, problem.observed.groups))
         gain = 0.5 * float((system.landmarks.pull**2).sum() - steps.ravel() @ system.gradient)
-        decrease = gain / max(here.cost, _LEAST_COST)
         if there.cost <= here.cost:
-            return there, max(damping * 0.1, _LEAST_DAMPING), decrease
-        if decrease <= _CONVERGED:
+            return there, max(damping * 0.1, _LEAST_DAMPING), gain
+        if gain <= _CONVERGED:
             break
         damping *= 10.0
     return here, damping, 0.0

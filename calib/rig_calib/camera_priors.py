@@ -4,8 +4,8 @@ from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
-from scipy.spatial.transform import Rotation
 
+from rig_calib.rotations import rotation_vectors
 from rig_protocol.poses import Pose, inverse
 
 Array = npt.NDArray[np.float64]
@@ -44,7 +44,7 @@ class CameraPriors:
 
     def _pose_error(self, T_rig_camera: Array) -> Array:
         difference = self.T_camera_prior @ T_rig_camera
-        turn = Rotation.from_matrix(difference[:, :3, :3]).as_rotvec()
+        turn = rotation_vectors(difference[:, :3, :3])
         return np.concatenate([turn, difference[:, :3, 3]], axis=1) * self.pose_weight
 
 

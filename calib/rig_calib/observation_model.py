@@ -15,8 +15,9 @@ import numpy.typing as npt
 from rig_calib.depth_model import DepthGrid, depth_basis
 from rig_calib.observation_kernels import Cameras, PlaneRows, PointRows
 from rig_calib.projection import distortion_inverse, from_pixels, undistort_pixels
+from rig_calib.rotations import right_jacobians, rotation_matrices
 from rig_protocol.camera import Intrinsics
-from rig_protocol.poses import Pose, hat
+from rig_protocol.poses import Pose
 
 Array = npt.NDArray[np.float64]
 Index = npt.NDArray[np.intp]
@@ -160,7 +161,7 @@ class FactoryModels:
         for adjusted, change in ((color, intrinsics), (grid, grid_intrinsics)):
             adjusted[:, :2] *= np.exp(change[:, :1])
             adjusted[:, 2 : 1 + change.shape[1]] += change[:, 1:]
-        turn, turn_jacobian = _small_turns(grid_pose[:, :3])
+        turn = rotation_matrices(grid_pose[:, :3])
         R, t = self.T_color_grid[:, :3, :3], self.T_color_grid[:, :3, 3]
         return Cameras(
             R_rig_camera=np.ascontiguousarray(T_rig_camera[:, :3, :3]),
@@ -172,7 +173,7 @@ class FactoryModels:
             raw_model=self.raw_model,
             bias=np.ascontiguousarray(bias),
             grid_turn=turn,
-            grid_turn_jacobian=turn_jacobian,
+            grid_turn_jacobian=right_jacobians(grid_pose[:, :3]),
         )
 
     def point_rows(self, seen: Observations) -> PointRows:
@@ -238,12 +239,3 @@ def adjusted_intrinsics(color: Intrinsics, state: Array) -> Intrinsics:
 
 def _numbers(intrinsics: Intrinsics) -> tuple[float, ...]:
     return (intrinsics.fx, intrinsics.fy, intrinsics.cx, intrinsics.cy, *intrinsics.dist)
-
-
-def _small_turns(phi: Array) -> tuple[Array, Array]:
-    """Exp (C,3,3) and right Jacobian (C,3,3) of rotation vectors (C,3) of some degrees, to fourth order."""
-    K = hat(phi)
-    square = K @ K
-    eye, cube, fourth = np.eye(3), square @ K, square @ square
-    turn = eye + K + square / 2.0 + cube / 6.0 + fourth / 24.0
-    return turn, eye - K / 2.0 + square / 6.0 - cube / 24.0 + fourth / 120.0

@@ -17,7 +17,7 @@ from rig_calib.observation_model import (
 )
 from rig_calib.projection import project, undistort_pixels
 from rig_protocol.camera import Intrinsics, RawDepthModel
-from rig_protocol.poses import inverse, left_jacobian, se3_exp, so3_exp, transform_points
+from rig_protocol.poses import inverse, se3_exp, so3_exp, transform_points
 from support.synthetic_rig import COLOR, DEPTH
 
 DISTORTED = Intrinsics(517.3, 516.5, 318.6, 255.3, dist=(0.2624, -0.9531, -0.0054, 0.0026, 1.1633))
@@ -187,14 +187,6 @@ def test_a_plane_is_predicted_as_deep_as_the_adjusted_models_see_it(
     np.testing.assert_allclose(
         residual, 0.0, atol=2e-3
     )  # the ray follows the grid's intrinsics to first order
-
-
-def test_the_small_turns_of_the_grid_are_exact_to_rounding() -> None:
-    at = state()
-    models = FactoryModels.of([COLOR], [grid_of(DEPTH)], TERMS)
-    cameras = models.with_states(at.T_rig_camera[None], at.beside_pose()[None])
-    np.testing.assert_allclose(cameras.grid_turn[0], so3_exp(at.grid_pose[:3]), atol=1e-9)
-    np.testing.assert_allclose(cameras.grid_turn_jacobian[0], left_jacobian(-at.grid_pose[:3]), atol=1e-9)
 
 
 def test_a_pixel_or_disparity_that_was_not_measured_says_nothing() -> None:
