@@ -188,6 +188,45 @@ def pattern(
     )
 
 
+@app.command()
+def export(
+    calibration: Annotated[Path, typer.Argument(help="A calibration.json.")],
+    form: Annotated[
+        str, typer.Option("--format", metavar="kalibr|ros2|urdf|colmap|nerfstudio|opencv", help="For whom.")
+    ],
+    out: Annotated[Path, typer.Option(help="File to write, or a folder; for colmap always a folder.")],
+    rig: Annotated[
+        Path | None,
+        typer.Option(
+            help="Where intrinsics stand: the rig folder (with its images), nominal.json or rig.toml."
+        ),
+    ] = None,
+    frames: Annotated[
+        int,
+        typer.Option(min=1, max=10_000, help="Panoramic frames of the folder to list: its rig was at rest."),
+    ] = 1,
+) -> None:
+    """Write a calibration for another program; docs/exports.md says which axes and how to load it."""
+    from rich.console import Console
+
+    from rig_calib.exports.exported_rig import exported_rig
+    from rig_calib.exports.formats import find_format, target_folder, write_export
+    from rig_calib.exports.known_rig import KnownRig, read_known_rig
+
+    chosen, result = find_format(form), _load(calibration)
+    known = KnownRig() if rig is None else read_known_rig(rig, frames)
+    exported = exported_rig(
+        result, known.models, known.images, known.image_root_from(target_folder(chosen, out))
+    )
+    made = chosen.export(exported)
+    console = Console(highlight=False, soft_wrap=True)
+    for path in write_export(chosen, made, out):
+        console.print(str(path), markup=False)
+    failed = [f"this calibration did not pass its gate: {why}" for why in result.failures]
+    for note in [*failed, *known.left_out(result.poses), *made.notes]:
+        console.print(note, style="yellow", markup=False)
+
+
 def main() -> None:
     """Entry point of `rig-calib`."""
     run_program(app)
