@@ -17,6 +17,9 @@ from rig_protocol.poses import Pose, hat, inverse, rotation_angle_deg
 
 Array = npt.NDArray[np.float64]
 
+ROOM_DISTANCE_M = 3.0
+"""Where the room usually is: sentences and rankings are about points this far away."""
+
 _HEIGHTS = np.tan(np.deg2rad((-20.0, 0.0, 20.0)))  # over the part of a view where neighbours overlap
 _MOTIONS = (
     "rolling about the viewing direction",
@@ -50,13 +53,12 @@ class PairUncertainty:
     """What is unknown of the pose of camera j against camera i.
 
     `covariance` (6,6) is of a turn of camera j about its own place and of its shift, on the axes of the room:
-    viewing direction of the pair, left, up. `T_room_i` and `T_room_j` have their origin amid the two.
+    viewing direction of the pair, left, up (see `pair_frame`).
     """
 
     i: int
     j: int
     covariance: Array
-    T_room_i: Pose
     T_room_j: Pose
     azimuth_rad: float
 
@@ -65,14 +67,12 @@ class PairUncertainty:
         cls, i: int, j: int, T_view_i: Pose, T_view_j: Pose, relative_covariance: Array
     ) -> "PairUncertainty":
         """From poses in a frame whose z is up, and the covariance of T_i_j on its right."""
-        axes = _pair_axes(T_view_i, T_view_j)
-        T_view_room = np.eye(4)
-        T_view_room[:3, :3] = axes
-        T_view_room[:3, 3] = (T_view_i[:3, 3] + T_view_j[:3, 3]) / 2
-        T_room_i, T_room_j = (inverse(T_view_room) @ T for T in (T_view_i, T_view_j))
+        T_view_room = pair_frame(T_view_i, T_view_j)
+        T_room_j = inverse(T_view_room) @ T_view_j
         turn = np.kron(np.eye(2), T_room_j[:3, :3])
         covariance = turn @ relative_covariance @ turn.T
-        return cls(i, j, covariance, T_room_i, T_room_j, float(np.arctan2(axes[1, 0], axes[0, 0])))
+        azimuth_rad = float(np.arctan2(T_view_room[1, 0], T_view_room[0, 0]))
+        return cls(i, j, covariance, T_room_j, azimuth_rad)
 
     @property
     def sigma(self) -> tuple[float, float]:
@@ -88,8 +88,8 @@ class PairUncertainty:
     def weakest_motion(self, distance_m: float) -> WeakestMotion:
         """What displaces points at this distance most.
 
-        Of the displacements' first principal component, the motion that contributes most to it, as large as it
-        is when that component is one standard deviation.
+        Of the displacements' first principal component, the motion that contributes most to it, as large as
+        it is when that component is one standard deviation.
         """
         J = self._by_motion(distance_m)
         variances, directions = np.linalg.eigh(J @ self.covariance @ J.T)
@@ -140,8 +140,11 @@ def worst_pair(pairs: Sequence[PairUncertainty], distance_m: float) -> PairUncer
     return max(pairs, key=lambda pair: pair.displacement_mm(distance_m), default=None)
 
 
-def _pair_axes(T_view_i: Pose, T_view_j: Pose) -> Array:
-    """Columns: where the two look on the mean, left of that and level, up."""
+def pair_frame(T_view_i: Pose, T_view_j: Pose) -> Pose:
+    """T_view_pair: origin amid two cameras, x where they look on the mean, y left of that and level.
+
+    `T_view_i` and `T_view_j` are poses in a frame whose z is up.
+    """
     forward = T_view_i[:3, 2] + T_view_j[:3, 2]
     if np.linalg.norm(forward) < 1e-6:  # back to back
         forward = T_view_i[:3, 2]
@@ -150,4 +153,7 @@ def _pair_axes(T_view_i: Pose, T_view_j: Pose) -> Array:
     if np.linalg.norm(left) < 1e-6:  # straight up or down: no direction is more level than another
         left = T_view_i[:3, 0] - forward * (forward @ T_view_i[:3, 0])
     left = left / np.linalg.norm(left)
-    return np.column_stack([forward, left, np.cross(forward, left)])
+    T = np.eye(4)
+    T[:3, :3] = np.column_stack([forward, left, np.cross(forward, left)])
+    T[:3, 3] = (T_view_i[:3, 3] + T_view_j[:3, 3]) / 2
+    return T

@@ -30,8 +30,8 @@ def normalised_error(estimated: Pose, true: Pose, covariance: Array | None) -> f
 class Consistency:
     """Mean normalised error squared per degree of freedom of several poses.
 
-    Above 1 the covariances promise too much, below 1 too little. `low` to `high` hold 95 % of means of so many
-    independent poses; poses of one rig share errors, and stray further.
+    Above 1 the covariances promise too much, below 1 too little. `low` to `high` hold 95 % of means of so
+    many independent poses; poses of one rig share errors, and stray further.
     """
 
     count: int
@@ -46,8 +46,8 @@ class Consistency:
         if not values:
             return None
         dof = _DOF * len(values)
-        low, high = scipy.stats.chi2.ppf((0.025, 0.975), dof) / dof
-        return cls(len(values), float(np.mean(values)), float(low), float(high))
+        low, high = (float(scipy.stats.chi2.ppf(share, dof)) / dof for share in (0.025, 0.975))
+        return cls(len(values), float(np.mean(values)), low, high)
 
     def to_dict(self) -> dict[str, float]:
         """Flat numbers for JSON."""
