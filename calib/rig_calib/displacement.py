@@ -140,6 +140,11 @@ def worst_pair(pairs: Sequence[PairUncertainty], distance_m: float) -> PairUncer
     return max(pairs, key=lambda pair: pair.displacement_mm(distance_m), default=None)
 
 
+def least_certain(pairs: Sequence[PairUncertainty]) -> PairUncertainty | None:
+    """The pair that stands out in figures and tables; None where there is nothing to compare it with."""
+    return worst_pair(pairs, ROOM_DISTANCE_M) if len(pairs) > 1 else None
+
+
 def pair_frame(T_view_i: Pose, T_view_j: Pose) -> Pose:
     """T_view_pair: origin amid two cameras, x where they look on the mean, y left of that and level.
 

@@ -7,7 +7,7 @@ import jinja2
 import numpy as np
 from markupsafe import Markup
 
-from rig_calib.displacement import ROOM_DISTANCE_M
+from rig_calib.displacement import ROOM_DISTANCE_M, least_certain
 from rig_calib.evidence import EdgeEvidence
 from rig_calib.figures import charts, rooms, tables
 from rig_calib.figures.advice import advice
@@ -114,7 +114,9 @@ def _displacement_chart(case: ReportCase) -> Markup | None:
     }
     series = [f"{distance:g} m" for distance in tables.DISTANCES_M]
     told = "Displacement between the cameras of each overlap, by distance"
-    return _markup(charts.grouped_bars(groups, series, "mm", told))
+    worst = least_certain(case.pairs)
+    highlight = None if worst is None else (names[worst.i], names[worst.j])
+    return _markup(charts.grouped_bars(groups, series, "mm", told, highlight))
 
 
 def _residual_charts(evidence: Sequence[EdgeEvidence]) -> list[Markup]:

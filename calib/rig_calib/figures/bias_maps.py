@@ -41,7 +41,7 @@ def bias_maps(case: ReportCase) -> tuple[list[Figure], float]:
         Figure.drawing(
             _picture(bias, limit_mm, view.model.color, _matched(view.camera_id, case.evidence), portrait),
             f"Depth correction of {view.name} over its image",
-            f"{view.name}: {bias.min():+.0f} to {bias.max():+.0f} mm",
+            f"{view.name}: {bias.min():+z.0f} to {bias.max():+z.0f} mm",
         )
         for view, bias in known
     ]

@@ -109,34 +109,46 @@ def robust_spread(values: Array) -> float:
 
 
 def grouped_bars(
-    groups: Mapping[tuple[str, str], Sequence[float]], series: Sequence[str], unit: str, description: str
+    groups: Mapping[tuple[str, str], Sequence[float]],
+    series: Sequence[str],
+    unit: str,
+    description: str,
+    highlight: tuple[str, str] | None = None,
 ) -> str:
     """A group of bars for each label (two lines), one bar a series, the top of the last one in numbers."""
     left, head, chart, foot = 44.0, 30.0, 190.0, 40.0
     bar = 13.0 if len(groups) <= 16 else 7.0
-    group = bar * len(series) + 18.0
-    width, base = left + group * len(groups), head + chart
+    step = bar * len(series) + 18.0
+    width, base = left + step * len(groups), head + chart
     top = nice_ceiling(max([max(values) for values in groups.values()], default=1.0))
-    parts = []
+    parts = [text(left - 6, 14, unit, "end")]
     for share in (0.0, 0.5, 1.0):
         y = base - share * chart
-        parts.append(line(left, y, width, y, "ink" if share == 0 else "faint"))
+        parts.append(line(left, y, width, y, "faint" if share else "ink"))
         parts.append(text(left - 6, y + 4, f"{share * top:g}", "end"))
     for k, (labels, values) in enumerate(groups.items()):
-        x = left + k * group + 9
-        for step, value in enumerate(values):
-            height = min(value / top, 1.0) * chart
-            parts.append(rectangle(x + step * bar, base - height, bar - 1.5, height, f"fill-step-{step}"))
-        last = x + (len(values) - 0.5) * bar
-        parts.append(text(last, base - min(values[-1] / top, 1.0) * chart - 5, f"{values[-1]:.1f}", "middle"))
-        middle = x + bar * len(values) / 2
-        parts += [text(middle, base + 16 + 14 * row, label, "middle") for row, label in enumerate(labels)]
-    for step, name in enumerate(series):
-        x = left + 9 + 58 * step
-        parts.append(rectangle(x, 4, 11, 11, f"fill-step-{step}"))
-        parts.append(text(x + 16, 14, name))
-    parts.append(text(left - 6, 14, unit, "end"))
+        heights = [min(value / top, 1.0) * chart for value in values]
+        css = "label worst" if labels == highlight else "label"
+        parts += _bar_group(left + k * step + 9, base, bar, heights, labels, css)
+        last = left + (k + 1) * step - 9 - bar / 2
+        parts.append(text(last, base - heights[-1] - 5, f"{values[-1]:.1f}", "middle", css))
+    for k, name in enumerate(series):
+        x = left + 9 + 58 * k
+        parts += [rectangle(x, 4, 11, 11, f"fill-step-{k}"), text(x + 16, 14, name)]
     return svg(width, base + foot, description, parts)
+
+
+def _bar_group(
+    x: float, base: float, bar: float, heights: Sequence[float], labels: Sequence[str], css: str
+) -> list[str]:
+    """Bars that stand side by side on `base`, their labels line by line below."""
+    parts = [
+        rectangle(x + k * bar, base - height, bar - 1.5, height, f"fill-step-{k}")
+        for k, height in enumerate(heights)
+    ]
+    middle = x + bar * len(heights) / 2
+    rows = enumerate(labels)
+    return parts + [text(middle, base + 16 + 14 * row, label, "middle", css) for row, label in rows]
 
 
 def nice_ceiling(value: float) -> float:

@@ -7,7 +7,7 @@ import numpy as np
 import numpy.typing as npt
 from markupsafe import Markup
 
-from rig_calib.displacement import ROOM_DISTANCE_M, pair_frame, worst_pair
+from rig_calib.displacement import ROOM_DISTANCE_M, least_certain, pair_frame
 from rig_calib.evidence import EdgeEvidence
 from rig_calib.figures import charts, pictures
 from rig_calib.figures.case import ReportCase, Stage
@@ -54,7 +54,7 @@ def _card(item: EdgeEvidence, case: ReportCase) -> OverlapCard:
     edge = next((edge for edge in case.calibration.edges if {edge.i, edge.j} == {item.i, item.j}), None)
     names = case.names
     title = f"{names[item.i]} – {names[item.j]}"
-    worst = worst_pair(case.pairs, ROOM_DISTANCE_M) if len(case.pairs) > 1 else None
+    worst = least_certain(case.pairs)
     is_worst = worst is not None and {worst.i, worst.j} == {item.i, item.j}
     unused = edge is not None and not edge.used
     return OverlapCard(

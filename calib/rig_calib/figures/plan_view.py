@@ -7,7 +7,7 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 
-from rig_calib.displacement import ROOM_DISTANCE_M, PairUncertainty, worst_pair
+from rig_calib.displacement import ROOM_DISTANCE_M, PairUncertainty, least_certain
 from rig_calib.figures.charts import ellipse, line, polygon, svg, text
 from rig_calib.projection import undistort_pixels
 from rig_calib.rig_calibration import CalibratedCamera, CalibratedEdge, RigCalibration
@@ -49,7 +49,7 @@ def plan_view(
     page = _Page.of(calibration.cameras, T_rig_view)
     covariances = _plan_covariances(calibration.cameras, T_rig_view)
     magnification = _magnification(covariances, page.px_per_m)
-    worst = worst_pair(pairs, ROOM_DISTANCE_M) if len(pairs) > 1 else None
+    worst = least_certain(pairs)
     parts = [_frustum(camera, intrinsics[camera.id], page) for camera in calibration.cameras]
     parts += [_edge(edge, calibration, page, worst) for edge in _drawn_edges(calibration)]
     for camera in calibration.cameras:
@@ -166,7 +166,7 @@ def _ellipse_bar(page: _Page, magnification: int | None) -> str:
     if magnification is None:
         return ""
     px_per_mm = page.px_per_m * magnification * 1e-3
-    length_mm = next((length for length in _NICE_LENGTHS_MM if length * px_per_mm <= _SIZE_PX / 5), 0.1)
+    length_mm = next((length for length in _NICE_LENGTHS_MM if length * px_per_mm <= _SIZE_PX / 8), 0.1)
     y, x = _SIZE_PX - 14.0, _SIZE_PX - 14.0
     label = text(x, y - 8, f"ellipses: {length_mm:g} mm (× {magnification})", "end")
     return line(x - length_mm * px_per_mm, y, x, y, "ink") + label

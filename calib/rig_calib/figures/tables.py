@@ -6,7 +6,13 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from rig_calib.displacement import ROOM_DISTANCE_M, PairUncertainty, pair_uncertainties, worst_pair
+from rig_calib.displacement import (
+    ROOM_DISTANCE_M,
+    PairUncertainty,
+    least_certain,
+    pair_uncertainties,
+    worst_pair,
+)
 from rig_calib.evidence import EdgeEvidence
 from rig_calib.figures.case import Stage
 from rig_calib.fusion.viewpoint import Viewpoint, rig_viewpoint
@@ -27,6 +33,10 @@ class Sigma:
 
     deg: float
     mm: float
+
+    def __str__(self) -> str:
+        """As `0.08° / 2.5 mm`."""
+        return f"{self.deg:.2f}° / {self.mm:.1f} mm"
 
 
 def worst_sigma(covariance: Array | None) -> Sigma | None:
@@ -50,10 +60,13 @@ def verdict(calibration: RigCalibration, expected: int) -> str:
 
 def _certainty(calibration: RigCalibration) -> str:
     """How well neighbours are known against each other: the worst pair, in words and millimetres."""
-    T_rig_view = rig_viewpoint(calibration.poses, calibration.rig_frame).T_rig_view
-    worst = worst_pair(pair_uncertainties(calibration, T_rig_view), ROOM_DISTANCE_M)
+    pairs: list[PairUncertainty] = []
+    if calibration.cameras:
+        T_rig_view = rig_viewpoint(calibration.poses, calibration.rig_frame).T_rig_view
+        pairs = pair_uncertainties(calibration, T_rig_view)
+    worst = worst_pair(pairs, ROOM_DISTANCE_M)
     if worst is None:
-        return f"Its method ({calibration.method}) states no uncertainty."
+        return f"It states no uncertainty of relative poses (method {calibration.method})."
     names = {camera.id: camera.name for camera in calibration.cameras}
     motion, mm = worst.weakest_motion(ROOM_DISTANCE_M), worst.displacement_mm(ROOM_DISTANCE_M)
     return (
@@ -101,7 +114,6 @@ def edge_rows(
     rows = []
     for edge in sorted(calibration.edges, key=lambda edge: (not edge.used, edge.i, edge.j)):
         residuals = kept_residuals([item for item in evidence if {item.i, item.j} == {edge.i, edge.j}])
-        sigma = worst_sigma(edge.relative_covariance)
         rows.append(
             {
                 "pair": f"{names.get(edge.i, edge.i)} – {names.get(edge.j, edge.j)}",
@@ -109,7 +121,7 @@ def edge_rows(
                 "inliers": str(edge.inliers),
                 "rms_mm": f"{edge.rms_mm:.1f}" if edge.inliers else UNKNOWN,
                 "median_px": f"{np.median(residuals):.2f}" if len(residuals) else UNKNOWN,
-                "sigma": f"{sigma.deg:.2f}° / {sigma.mm:.1f} mm" if sigma else UNKNOWN,
+                "sigma": str(worst_sigma(edge.relative_covariance) or UNKNOWN),
                 "moved": _moved(edge, calibration.poses),
                 "used": "yes" if edge.used else "",
                 "reason": edge.reason or "",
@@ -130,12 +142,12 @@ def displacement_rows(
 ) -> list[dict[str, str]]:
     """A row for every overlap around the rig: millimetres at each distance, and what causes most of them."""
     names = {camera.id: camera.name for camera in calibration.cameras}
-    worst = worst_pair(pairs, ROOM_DISTANCE_M) if len(pairs) > 1 else None
+    worst = least_certain(pairs)
     return [
         {
             "pair": f"{names[pair.i]} – {names[pair.j]}",
             "worst": "yes" if pair is worst else "",
-            "sigma": f"{pair.sigma[0]:.2f}° / {pair.sigma[1]:.1f} mm",
+            "sigma": str(Sigma(*pair.sigma)),
             **{f"at_{d:g}": f"{pair.displacement_mm(d):.1f}" for d in DISTANCES_M},
             "weakest": str(pair.weakest_motion(ROOM_DISTANCE_M)),
             "differ": _differ(pair, stages),
@@ -192,7 +204,8 @@ def _pose_cells(camera: CalibratedCamera, viewpoint: Viewpoint) -> dict[str, str
         "roll": _degrees(roll),
         "sigma_deg": f"{sigma.deg:.3f}" if sigma else UNKNOWN,
         "sigma_mm": f"{sigma.mm:.2f}" if sigma else UNKNOWN,
-        "sigma_frame": f"{in_frame.deg:.2f}° / {in_frame.mm:.1f} mm" if in_frame else UNKNOWN,
+        "sigma": str(sigma or UNKNOWN),
+        "sigma_frame": str(in_frame or UNKNOWN),
         "depth_scale": f"{100 * correction.coefficients[0]:+.2f} %" if correction else UNKNOWN,
     }
 
