@@ -145,6 +145,12 @@ def least_certain(pairs: Sequence[PairUncertainty]) -> PairUncertainty | None:
     return worst_pair(pairs, ROOM_DISTANCE_M) if len(pairs) > 1 else None
 
 
+def least_certain_of(pairs: Sequence[PairUncertainty], count: int) -> list[PairUncertainty]:
+    """At most so many pairs, the least certain ones, in the order that they have."""
+    ranked = sorted(pairs, key=lambda pair: -pair.displacement_mm(ROOM_DISTANCE_M))[:count]
+    return [pair for pair in pairs if pair in ranked]
+
+
 def pair_frame(T_view_i: Pose, T_view_j: Pose) -> Pose:
     """T_view_pair: origin amid two cameras, x where they look on the mean, y left of that and level.
 

@@ -7,7 +7,7 @@ import jinja2
 import numpy as np
 from markupsafe import Markup
 
-from rig_calib.displacement import ROOM_DISTANCE_M, least_certain
+from rig_calib.displacement import ROOM_DISTANCE_M, PairUncertainty, least_certain, least_certain_of
 from rig_calib.evidence import EdgeEvidence
 from rig_calib.figures import charts, rooms, tables
 from rig_calib.figures.advice import advice
@@ -22,6 +22,7 @@ from rig_calib.whole_file import whole_file
 from rig_protocol.poses import Pose
 
 _RESIDUAL_LIMIT_PX = 5.0
+_MAX_PAIRS_SHOWN = 16  # in plan and chart; where all cameras see each other there are many more
 
 
 def write_report(
@@ -62,6 +63,7 @@ def report_html(
         displacement_chart=_displacement_chart(case),
         displacements=tables.displacement_rows(calibration, case.pairs, case.stages),
         distances_m=tables.DISTANCES_M,
+        pairs_shown=len(_shown(case.pairs)),
         room_distance_m=ROOM_DISTANCE_M,
         clouds=rooms.clouds(case),
         cuts=rooms.cuts(case),
@@ -101,7 +103,7 @@ def _more_key_figures(case: ReportCase) -> dict[str, str]:
 def _plan(case: ReportCase) -> PlanView | None:
     if case.viewpoint is None or not case.calibration.poses.keys() <= case.intrinsics.keys():
         return None
-    return plan_view(case.calibration, case.intrinsics, case.viewpoint.T_rig_view, case.pairs)
+    return plan_view(case.calibration, case.intrinsics, case.viewpoint.T_rig_view, _shown(case.pairs))
 
 
 def _displacement_chart(case: ReportCase) -> Markup | None:
@@ -110,13 +112,17 @@ def _displacement_chart(case: ReportCase) -> Markup | None:
     names = {camera.id: camera.name for camera in case.calibration.cameras}
     groups = {
         (names[pair.i], names[pair.j]): [pair.displacement_mm(d) for d in tables.DISTANCES_M]
-        for pair in case.pairs
+        for pair in _shown(case.pairs)
     }
     series = [f"{distance:g} m" for distance in tables.DISTANCES_M]
     told = "Displacement between the cameras of each overlap, by distance"
     worst = least_certain(case.pairs)
     highlight = None if worst is None else (names[worst.i], names[worst.j])
     return _markup(charts.grouped_bars(groups, series, "mm", told, highlight))
+
+
+def _shown(pairs: Sequence[PairUncertainty]) -> list[PairUncertainty]:
+    return least_certain_of(pairs, _MAX_PAIRS_SHOWN)
 
 
 def _residual_charts(evidence: Sequence[EdgeEvidence]) -> list[Markup]:

@@ -7,7 +7,7 @@ import numpy as np
 import numpy.typing as npt
 from markupsafe import Markup
 
-from rig_calib.displacement import ROOM_DISTANCE_M, least_certain, pair_frame
+from rig_calib.displacement import ROOM_DISTANCE_M, PairUncertainty, least_certain, pair_frame
 from rig_calib.evidence import EdgeEvidence
 from rig_calib.figures import charts, pictures
 from rig_calib.figures.case import ReportCase, Stage
@@ -42,11 +42,14 @@ class OverlapCard:
 
 
 def overlap_cards(case: ReportCase) -> list[OverlapCard]:
-    """A card for each edge with matches; where there are too many, for those with most inliers."""
+    """A card for each edge with matches; of too many, for the least certain and those with most inliers."""
     first: dict[tuple[int, int], EdgeEvidence] = {}
     for item in case.evidence:
         first.setdefault((item.i, item.j), item)
-    shown = sorted(first.values(), key=lambda item: -item.inlier.sum())[:_MAX_CARDS]
+    worst = least_certain(case.pairs)
+    shown = sorted(first.values(), key=lambda item: (not _is_of(worst, item), -item.inlier.sum()))[
+        :_MAX_CARDS
+    ]
     return [_card(item, case) for item in sorted(shown, key=lambda item: (item.i, item.j))]
 
 
@@ -54,8 +57,7 @@ def _card(item: EdgeEvidence, case: ReportCase) -> OverlapCard:
     edge = next((edge for edge in case.calibration.edges if {edge.i, edge.j} == {item.i, item.j}), None)
     names = case.names
     title = f"{names[item.i]} – {names[item.j]}"
-    worst = least_certain(case.pairs)
-    is_worst = worst is not None and {worst.i, worst.j} == {item.i, item.j}
+    is_worst = _is_of(least_certain(case.pairs), item)
     unused = edge is not None and not edge.used
     return OverlapCard(
         title=title,
@@ -66,6 +68,10 @@ def _card(item: EdgeEvidence, case: ReportCase) -> OverlapCard:
         charts=_histograms(item),
         cuts=_cut_figures(item, edge, title, case),
     )
+
+
+def _is_of(pair: PairUncertainty | None, item: EdgeEvidence) -> bool:
+    return pair is not None and {pair.i, pair.j} == {item.i, item.j}
 
 
 def _facts(item: EdgeEvidence, case: ReportCase) -> str:

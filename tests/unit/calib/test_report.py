@@ -188,6 +188,12 @@ def test_what_would_help_most_names_the_overlaps_and_what_to_do() -> None:
     assert loop.startswith("No loop of overlaps closes")
 
 
+def test_an_overlap_that_the_others_make_up_for_is_not_asked_for() -> None:
+    edges = (edge(0, 1), edge(1, 2), edge(0, 2), edge(2, 3, used=False, reason="few"))
+    calibration = replace(good_calibration(), edges=edges)
+    assert advice(calibration, pair_uncertainties(calibration, np.eye(4)), {}) == []
+
+
 def test_nothing_is_advised_when_nothing_stands_out() -> None:
     calibration = replace(good_calibration(), edges=tuple(edge(k, (k + 1) % 12) for k in range(12)))
     assert advice(calibration, pair_uncertainties(calibration, np.eye(4)), {}) == []
@@ -302,6 +308,18 @@ def test_a_calibration_that_placed_no_camera_still_has_a_report(tmp_path: Path) 
     text = PageReader((tmp_path / "report.html").read_text(encoding="utf-8")).text
     assert "0 of 12 cameras placed" in text
     assert [path.name for path in tmp_path.iterdir()] == ["report.html"]
+
+
+def test_where_overlaps_are_many_the_least_certain_are_drawn_and_all_are_in_the_table() -> None:
+    edges = [
+        edge(k, (k + step) % 12, scale=3.0 if (k, step) == (3, 2) else 1.0)
+        for k in range(12)
+        for step in (1, 2)
+    ]
+    reader = PageReader(report_html(replace(good_calibration(), edges=tuple(edges)), VIEWS))
+    assert "The 16 least certain of 24 overlaps." in reader.text
+    assert [str(values["class"]) for values in reader.all("text")].count("label worst") == 4
+    assert len([values for values in reader.all("rect") if values["class"] == "fill-step-3"]) == 16 + 1
 
 
 def test_matches_of_an_edge_that_failed_are_shown_too() -> None:
