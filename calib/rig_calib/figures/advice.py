@@ -28,8 +28,8 @@ def advice(
         )
     if calibration.method == "paper":
         told.append(
-            "The method paper states no uncertainty and corrects no depth, whose usual bias of a percent leaves "
-            "about 0.4° and 20 mm in each overlap: calibrate with --method joint for both."
+            "The method paper states no uncertainty and corrects no depth, whose usual bias of a percent "
+            "leaves about 0.4° and 20 mm in each overlap: calibrate with --method joint for both."
         )
     return told
 
