@@ -13,7 +13,6 @@ import numpy.typing as npt
 import scipy.linalg
 import scipy.sparse
 import scipy.sparse.linalg
-from scipy.spatial.transform import Rotation
 
 from rig_calib.camera_priors import CameraPriors, prior_pose, weights_of
 from rig_calib.depth_model import DepthGrid
@@ -27,6 +26,7 @@ from rig_calib.observation_model import (
     Observations,
     PlaneObservations,
 )
+from rig_calib.rotations import rotation_matrices
 from rig_protocol.camera import Intrinsics
 from rig_protocol.poses import Pose
 
@@ -36,12 +36,11 @@ Index = npt.NDArray[np.intp]
 # Where the kernel starts to bend, in standard deviations: 95 % efficiency on clean data (Holland &
 # Welsch 1977), squared, for a pixel's two coordinates and for a disparity.
 _CAUCHY_SQUARED = 2.385**2
-_LEAST_CURVATURE = 0.1  # beyond the kernel's bend its curvature is negative
-_NEAR = 0.01  # relative decrease of the cost to be expected
+_LEAST_CURVATURE = 0.2  # beyond the kernel's bend its curvature is negative
+_NEAR = 0.003  # relative decrease of the cost to be expected
 _MAX_ITERATIONS = 40
-_CONVERGED = 1e-6
-_LEAST_COST = 1e-12
-_FIRST_DAMPING, _LEAST_DAMPING, _MAX_DAMPING = 1e-4, 1e-12, 1e8
+_CONVERGED = 1e-3  # the decrease expected; one standard deviation costs a half
+_FIRST_DAMPING, _LEAST_DAMPING, _MAX_DAMPING = 1e-6, 1e-12, 1e8
 # From here on, 40 cameras or so, a ring is solved faster as a sparse system.
 _MANY_STATES = 1000
 
@@ -50,9 +49,10 @@ _MANY_STATES = 1000
 class AdjustedCamera:
     """One camera of a problem: factory models, priors, and the state to start from.
 
-    `T_prior` with `pose_sigma` (6,) is the drawing's pose; None = no prior. A fixed pose defines the frame. The
-    other `_sigma`s are standard deviations, about `expected` (None: the factory model), of a `CameraState`'s
-    fields; 0 holds a term at its start. `gravity` (3,) is down in the camera frame, known to `gravity_sigma` rad.
+    `T_prior` with `pose_sigma` (6,) is the drawing's pose; None = no prior. A fixed pose defines the frame.
+    The other `_sigma`s are standard deviations, about `expected` (None: the factory model), of a
+    `CameraState`'s fields; 0 holds a term at its start. `gravity` (3,) is down in the camera frame, known to
+    `gravity_sigma` rad.
     """
 
     color: Intrinsics
@@ -104,17 +104,17 @@ def adjust(
 ) -> Adjustment:
     """Minimise the robust cost from the cameras' start states, `points` (P,3) and `planes` (K,3), rig frame.
 
-    A plane π holds the points X with π · X = 1. Every point needs two observations or more. Without pose priors
-    one pose must be fixed.
+    A plane π holds the points X with π · X = 1. Every point needs two observations or more. Without pose
+    priors one pose must be fixed.
     """
     planes = np.empty((0, 3)) if planes is None else planes
     seen_planes = PlaneObservations.none() if seen_planes is None else seen_planes
     problem = _Problem.of(cameras, LandmarkCounts(len(points), len(planes)), seen, seen_planes)
     here = problem.evaluate(_start(cameras, points, planes))
-    damping, decrease, iterations = _FIRST_DAMPING, 1.0, 0
-    while decrease > _CONVERGED and iterations < _MAX_ITERATIONS:
+    damping, gain, iterations = _FIRST_DAMPING, np.inf, 0
+    while gain > _CONVERGED and iterations < _MAX_ITERATIONS:
         iterations += 1
-        here, damping, decrease = _descend(problem, here, damping, decrease < _NEAR)
+        here, damping, gain = _descend(problem, here, damping, near=gain < _NEAR * here.cost)
     return _result(problem, here, iterations)
 
 
@@ -129,10 +129,10 @@ class _Estimate:
     def moved(self, steps: Array, landmarks: Landmarks, groups: Groups) -> "_Estimate":
         """Steps of the cameras (C·S,) and of the landmarks that go with them; T · Exp(δ) to first order."""
         by_camera, by_landmark = steps.reshape(len(self.T_rig_camera), -1), np.empty_like(self.landmarks)
-        landmark_steps(groups, landmarks, by_camera, by_landmark)
+        landmark_steps(groups.camera, groups.first_group, *landmarks, by_camera, by_landmark)
         R = self.T_rig_camera[:, :3, :3]
         poses = self.T_rig_camera.copy()
-        poses[:, :3, :3] = R @ Rotation.from_rotvec(by_camera[:, :3]).as_matrix()
+        poses[:, :3, :3] = R @ rotation_matrices(by_camera[:, :3])
         poses[:, :3, 3] += (R @ by_camera[:, 3:6, None])[..., 0]
         return _Estimate(poses, self.beside_pose + by_camera[:, 6:], self.landmarks + by_landmark)
 
@@ -148,7 +148,7 @@ class _Evaluation:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class _Reduced:
-    """The cameras' normal equations, landmarks eliminated: `normal` (C·S,C·S), lower triangle, `gradient` (C·S,)."""
+    """Normal equations of the cameras: lower triangle of `normal` (C·S,C·S), and `gradient` (C·S,)."""
 
     normal: Array
     gradient: Array
@@ -186,7 +186,9 @@ class _Problem:
             self.models.with_states(estimate.T_rig_camera, estimate.beside_pose), estimate.landmarks
         )
         cost = robust_cost(self.observed.kernels, rows.residual, _CAUCHY_SQUARED)
-        return _Evaluation(estimate, rows, cost + self.priors.cost(estimate.T_rig_camera, estimate.beside_pose))
+        return _Evaluation(
+            estimate, rows, cost + self.priors.cost(estimate.T_rig_camera, estimate.beside_pose)
+        )
 
     def reduce(self, estimate: _Estimate, rows: Rows, damping: float) -> _Reduced:
         """Eliminate the landmarks from rows that are weighted."""
@@ -194,18 +196,17 @@ class _Problem:
         information, gradient = self.priors.normal_equations(estimate.T_rig_camera, estimate.beside_pose)
         normal = np.zeros((count, size, count, size))
         np.einsum("cscs->cs", normal)[:] = information
-        landmarks = Landmarks.empty(self.observed.groups, size)
-        eliminate(self.observed.groups, *rows, damping, normal, gradient, landmarks)
+        landmarks = eliminate(self.observed.groups, *rows, damping, normal, gradient)
         return _Reduced(normal.reshape(count * size, count * size), gradient.ravel(), landmarks)
 
 
 def _descend(
     problem: _Problem, here: _Evaluation, damping: float, near: bool
 ) -> tuple[_Evaluation, float, float]:
-    """One step downhill: where it leads, the damping of the next, and the share of the cost that it should take.
+    """One step downhill: where it leads, the next one's damping, and the decrease of the cost expected of it.
 
-    Far from the minimum reweighted least squares is safe; near it, the kernel's own curvature is fast. Turns the
-    rows of `here` into weighted ones.
+    Far from the minimum reweighted least squares is safe; near it, the kernel's own curvature is fast. Turns
+    the rows of `here` into weighted ones.
     """
     reweight(problem.observed.kernels, *here.rows, _CAUCHY_SQUARED, _LEAST_CURVATURE if near else 1.0)
     while damping < _MAX_DAMPING:
@@ -213,10 +214,9 @@ def _descend(
         steps = _solve(system, problem.free, damping)
         there = problem.evaluate(here.estimate.moved(steps, system.landmarks, problem.observed.groups))
         gain = 0.5 * float((system.landmarks.pull**2).sum() - steps.ravel() @ system.gradient)
-        decrease = gain / max(here.cost, _LEAST_COST)
         if there.cost <= here.cost:
-            return there, max(damping * 0.1, _LEAST_DAMPING), decrease
-        if decrease <= _CONVERGED:
+            return there, max(damping * 0.1, _LEAST_DAMPING), gain
+        if gain <= _CONVERGED:
             break
         damping *= 10.0
     return here, damping, 0.0
@@ -229,7 +229,9 @@ def _solve(system: _Reduced, free: Index, damping: float) -> Array:
     np.fill_diagonal(lower, 1.0 + damping)
     right = system.gradient[free] * scale
     if len(system.normal) <= _MANY_STATES:
-        solution = scipy.linalg.cho_solve(scipy.linalg.cho_factor(lower, lower=True, check_finite=False), right)
+        solution = scipy.linalg.cho_solve(
+            scipy.linalg.cho_factor(lower, lower=True, check_finite=False), right
+        )
     else:
         below = scipy.sparse.csc_array(np.tril(lower, -1))
         whole = scipy.sparse.csc_array(below + below.T + scipy.sparse.diags_array(np.diag(lower)))
@@ -282,7 +284,11 @@ def _start(cameras: Sequence[AdjustedCamera], points: Array, planes: Array) -> _
 
 
 def _gravity(cameras: Sequence[AdjustedCamera]) -> GravityObservations:
-    felt = [(c, camera.gravity, camera.gravity_sigma) for c, camera in enumerate(cameras) if camera.gravity is not None]
+    felt = [
+        (c, camera.gravity, camera.gravity_sigma)
+        for c, camera in enumerate(cameras)
+        if camera.gravity is not None
+    ]
     return GravityObservations(
         np.array([c for c, _, _ in felt], dtype=np.intp),
         np.array([direction for _, direction, _ in felt]).reshape(-1, 3),
@@ -293,7 +299,9 @@ def _gravity(cameras: Sequence[AdjustedCamera]) -> GravityObservations:
 def _priors(cameras: Sequence[AdjustedCamera]) -> CameraPriors:
     poses = [prior_pose(camera.T_prior, camera.pose_sigma) for camera in cameras]
     expected = [
-        np.zeros(len(camera.sigma_beside_pose())) if camera.expected is None else camera.expected.beside_pose()
+        np.zeros(len(camera.sigma_beside_pose()))
+        if camera.expected is None
+        else camera.expected.beside_pose()
         for camera in cameras
     ]
     return CameraPriors(

@@ -4,13 +4,14 @@ from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
-from scipy.spatial.transform import Rotation
 
+from rig_calib.rotations import rotation_vectors
 from rig_protocol.poses import Pose, inverse
 
 Array = npt.NDArray[np.float64]
 
-# The kernel of a pose prior bends at the 95 % quantile of its six numbers: a camera may be far from its drawing.
+# The kernel of a pose prior bends at the 95 % quantile of its six numbers: a camera may be far from its
+# drawing.
 _BEND = 12.6
 
 
@@ -18,8 +19,8 @@ _BEND = 12.6
 class CameraPriors:
     """Priors of C cameras. Weights are 1/σ, zero for what is not known.
 
-    On the pose: T_prior⁻¹ · T = (rotation vector, translation) is zero with `pose_weight` (C,6), through a Cauchy
-    kernel. On the states beside it: `expected` (C,S−6) with `weight` (C,S−6).
+    On the pose: T_prior⁻¹ · T = (rotation vector, translation) is zero with `pose_weight` (C,6), through a
+    Cauchy kernel. On the states beside it: `expected` (C,S−6) with `weight` (C,S−6).
     """
 
     T_camera_prior: Array
@@ -43,7 +44,7 @@ class CameraPriors:
 
     def _pose_error(self, T_rig_camera: Array) -> Array:
         difference = self.T_camera_prior @ T_rig_camera
-        turn = Rotation.from_matrix(difference[:, :3, :3]).as_rotvec()
+        turn = rotation_vectors(difference[:, :3, :3])
         return np.concatenate([turn, difference[:, :3, 3]], axis=1) * self.pose_weight
 
 

@@ -23,7 +23,7 @@ Array = npt.NDArray[np.float64]
 Mask = npt.NDArray[np.bool_]
 
 MODEL_NAME = "polynomial-scale"
-MAX_TERMS = 6
+MAX_TERMS = 10
 
 MIN_RANGE_M, MAX_RANGE_M = 0.4, 8.0
 DISPARITY_SIGMA = 0.5
@@ -37,10 +37,10 @@ _MM_ROUNDING_M = 1e-3 / np.sqrt(12.0)
 
 @dataclass(frozen=True, slots=True)
 class DepthCorrection:
-    """z_true = z · (1 + Σ c_k b_k(x, y)), with b = (1, x, y, x², xy, y²) as far as there are coefficients.
+    """z_true = z · (1 + Σ c_k b_k(x, y)), b = (1, x, y, x², xy, y², x³, x²y, xy², y³) as far as there are c.
 
-    x = (u − cx)/fx and y = (v − cy)/fy of the pixel (u, v) that holds the
-    depth, in the camera whose grid it is on.
+    x = (u − cx)/fx and y = (v − cy)/fy of the pixel (u, v) that holds the depth, in the camera whose grid it
+    is on.
     """
 
     coefficients: tuple[float, ...]
@@ -49,7 +49,8 @@ class DepthCorrection:
         """The `depth_correction` object of `calibration.json`."""
         return {
             "model": MODEL_NAME,
-            "equation": "z_true = z * (1 + sum c_k b_k(x, y)); b = 1, x, y, x^2, xy, y^2; "
+            "equation": "z_true = z * (1 + sum c_k b_k(x, y)); "
+            "b = 1, x, y, x^2, xy, y^2, x^3, x^2 y, x y^2, y^3; "
             "x = (u - cx)/fx, y = (v - cy)/fy",
             "coefficients": list(self.coefficients),
         }
@@ -71,8 +72,10 @@ class DepthCorrection:
 
 
 def depth_basis(x: Array, y: Array, terms: int) -> Array:
-    """The basis (..., terms) of the correction: 1, x, y, x², xy, y²."""
-    return np.stack([np.ones_like(x), x, y, x * x, x * y, y * y][:terms], axis=-1)
+    """The basis (..., terms) of the correction: 1, x, y, x², xy, y², x³, x²y, xy², y³."""
+    square, product, other = x * x, x * y, y * y
+    basis = [np.ones_like(x), x, y, square, product, other, square * x, square * y, x * other, y * other]
+    return np.stack(basis[:terms], axis=-1) if terms else np.empty((*np.shape(x), 0))
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -7,7 +7,7 @@ import numpy as np
 import numpy.typing as npt
 
 from rig_calib.normal_equations import Groups
-from rig_calib.observation_kernels import Cameras, plane_rows, point_rows
+from rig_calib.observation_kernels import Cameras, disparity_rows, pixel_rows, plane_rows
 from rig_calib.observation_model import FactoryModels, Observations, PlaneObservations
 from rig_protocol.poses import hat
 
@@ -40,12 +40,11 @@ class GravityObservations:
         return len(self.camera)
 
     def rows(self, cameras: Cameras, down: Array, out: Rows) -> None:
-        """Three rows a camera: `down` (3,) in the rig frame, turned into the camera, less what it measured."""
+        """Three rows a camera: `down` (3,), rig frame, turned into the camera, less what it measured."""
         R = cameras.R_rig_camera[self.camera]
         weight = 1.0 / self.sigma[:, None]
         turned = down @ R
         out.residual[:] = ((turned - self.directions) * weight).ravel()
-        out.by_state[:] = 0.0
         out.by_state[:, :3] = (hat(turned) * weight[..., None]).reshape(-1, 3)
         out.by_landmark[:] = (R.transpose(0, 2, 1) * weight[..., None]).reshape(-1, 3)
 
@@ -58,7 +57,7 @@ class LandmarkCounts(NamedTuple):
 
 
 class LandmarkRows:
-    """The observations of points, of planes, and of gravity, which is a landmark at infinity, in this order."""
+    """The observations of points, of planes, and of gravity (a landmark at infinity), in this order."""
 
     def __init__(
         self,
@@ -82,17 +81,20 @@ class LandmarkRows:
             _groups(self._planes.camera, self._planes.plane, counts.planes, 1),
             _groups(gravity.camera, np.zeros(len(gravity), np.intp), min(len(gravity), 1), 3),
         )
-        blocks = np.concatenate([[0], np.tile([2, 1], len(seen)), np.ones(len(seen_planes)), np.full(len(gravity), 3)])
+        blocks = np.concatenate(
+            [[0], np.tile([2, 1], len(seen)), np.ones(len(seen_planes)), np.full(len(gravity), 3)]
+        )
         self.kernels = np.cumsum(blocks).astype(np.intp)
         """Where (K+1,) the blocks of rows begin that share a robust kernel each."""
 
     def rows(self, cameras: Cameras, landmarks: Array) -> Rows:
         """The rows of all observations of `landmarks` (L,3)."""
         total = sum(self._row_counts)
-        rows = Rows(np.empty(total), np.empty((total, self._state_size)), np.empty((total, 3)))
+        rows = Rows(np.zeros(total), np.zeros((total, self._state_size)), np.zeros((total, 3)))
         of_points, of_planes, of_gravity = map(rows.part, _slices(self._row_counts))
         points, planes, down = (landmarks[part] for part in _slices(self._landmark_counts))
-        point_rows(cameras, self._points, points, *of_points)
+        pixel_rows(cameras, self._points, points, *of_points)
+        disparity_rows(cameras, self._points, points, *of_points)
         if len(of_planes.residual):
             plane_rows(cameras, self._planes, planes, *of_planes)
         if len(of_gravity.residual):

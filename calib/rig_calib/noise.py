@@ -6,6 +6,7 @@ import numpy as np
 import numpy.typing as npt
 import scipy.spatial
 
+from rig_calib.crowding import crowding
 from rig_calib.depth_model import DISPARITY_SIGMA
 from rig_calib.observation_model import Observations
 
@@ -109,16 +110,4 @@ def _crowded(sigma: float | Array, pixels: Array, length_px: float) -> Array:
 
     n measurements with one error are worth one: the variance is multiplied by their number.
     """
-    return np.asarray(np.square(sigma) * _crowding(pixels, length_px))
-
-
-def _crowding(pixels: Array, length_px: float) -> Array:
-    """Σ exp(−r²/2L²) over all points, itself included: how many share a place (N,)."""
-    if not len(pixels):
-        return np.empty(0)
-    tree = scipy.spatial.KDTree(pixels)
-    near = tree.sparse_distance_matrix(tree, 3.0 * length_px, output_type="coo_matrix")
-    shared = np.exp(-0.5 * (near.data / length_px) ** 2)
-    # The distance of a point to itself is 0, which a sparse matrix may or may not store.
-    off_diagonal = near.row != near.col
-    return np.asarray(1.0 + np.bincount(near.row[off_diagonal], shared[off_diagonal], len(pixels)))
+    return np.asarray(np.square(sigma) * crowding(pixels, length_px))

@@ -1,8 +1,9 @@
 """What a camera should have measured of a landmark, and the derivatives of the difference.
 
 A camera's state is its pose T_rig_camera and what is wrong with its factory model: its depth bias (the
-coefficients of `DepthCorrection`), its colour intrinsics, the pose of its depth grid and that one's intrinsics.
-A landmark is a point, observed by its pixel and the disparity there, or a plane, observed by disparities.
+coefficients of `DepthCorrection`), its colour intrinsics, the pose of its depth grid and that one's
+intrinsics. A landmark is a point, observed by its pixel and the disparity there, or a plane, observed by
+disparities.
 """
 
 from collections.abc import Sequence
@@ -14,8 +15,9 @@ import numpy.typing as npt
 from rig_calib.depth_model import DepthGrid, depth_basis
 from rig_calib.observation_kernels import Cameras, PlaneRows, PointRows
 from rig_calib.projection import distortion_inverse, from_pixels, undistort_pixels
+from rig_calib.rotations import right_jacobians, rotation_matrices
 from rig_protocol.camera import Intrinsics
-from rig_protocol.poses import Pose, hat
+from rig_protocol.poses import Pose
 
 Array = npt.NDArray[np.float64]
 Index = npt.NDArray[np.intp]
@@ -25,24 +27,20 @@ POSE = slice(0, 6)
 INTRINSIC_TERMS, GRID_POSE_TERMS, GRID_INTRINSIC_TERMS = 4, 6, 3
 
 
-def _zeros(terms: int) -> Array:
-    return field(default_factory=lambda: np.zeros(terms))  # type: ignore[no-any-return]
-
-
 @dataclass(frozen=True, slots=True, eq=False)
 class CameraState:
     """What the adjustment estimates of one camera; zeros are the factory model.
 
-    `bias` (B,): coefficients of `DepthCorrection`. `intrinsics`: (log focal scale, Δcx, Δcy, Δk1) of the colour
-    camera. `grid_pose`: rotation vector and translation on the right of T_color_grid. `grid_intrinsics`: (log
-    focal scale, Δcx, Δcy) of the grid.
+    `bias` (B,): coefficients of `DepthCorrection`. `intrinsics`: (log focal scale, Δcx, Δcy, Δk1) of the
+    colour camera. `grid_pose`: rotation vector and translation on the right of T_color_grid.
+    `grid_intrinsics`: (log focal scale, Δcx, Δcy) of the grid.
     """
 
     T_rig_camera: Pose
     bias: Array
-    intrinsics: Array = _zeros(INTRINSIC_TERMS)
-    grid_pose: Array = _zeros(GRID_POSE_TERMS)
-    grid_intrinsics: Array = _zeros(GRID_INTRINSIC_TERMS)
+    intrinsics: Array = field(default_factory=lambda: np.zeros(INTRINSIC_TERMS))
+    grid_pose: Array = field(default_factory=lambda: np.zeros(GRID_POSE_TERMS))
+    grid_intrinsics: Array = field(default_factory=lambda: np.zeros(GRID_INTRINSIC_TERMS))
 
     def beside_pose(self) -> Array:
         """All but the pose (S−6,), in the order of the state's columns."""
@@ -59,9 +57,9 @@ class CameraState:
 class Observations:
     """M observations; `camera` (M,) and `point` (M,) index the problem's cameras and points.
 
-    The residual of `pixels` (M,2) is `pixel_whitener` (M,2,2) times the difference in pixels: I/σ for a keypoint,
-    of rank one for an edge, zero for none. `disparity` (M,), NaN = none, with its `slope` (M,2) around
-    `grid_pixels` (M,2) and `disparity_sigma` (M,).
+    The residual of `pixels` (M,2) is `pixel_whitener` (M,2,2) times the difference in pixels: I/σ for a
+    keypoint, of rank one for an edge, zero for none. `disparity` (M,), NaN = none, with its `slope` (M,2)
+    around `grid_pixels` (M,2) and `disparity_sigma` (M,).
     """
 
     camera: Index
@@ -90,7 +88,7 @@ class Observations:
         adjugate = W[:, (0, 1), (0, 1)].sum(axis=1)[:, None, None] * np.eye(2) - W
         pseudo_inverse = np.where(full[:, None, None], adjugate, W.transpose(0, 2, 1))
         by = np.where(full, determinant, np.where(size > 0.0, size, 1.0))
-        return np.einsum("mij,mj->mi", pseudo_inverse, residuals) / by[:, None]
+        return np.asarray(np.einsum("mij,mj->mi", pseudo_inverse, residuals) / by[:, None])
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -128,7 +126,7 @@ def isotropic_whitener(sigma: Array) -> Array:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class FactoryModels:
-    """The models of C cameras before anything is adjusted, as arrays; intrinsics (C,9) as `Cameras` has them."""
+    """The models of C cameras before anything is adjusted; intrinsics (C,9) as `Cameras` has them."""
 
     color: Array
     grid: Array
@@ -163,7 +161,7 @@ class FactoryModels:
         for adjusted, change in ((color, intrinsics), (grid, grid_intrinsics)):
             adjusted[:, :2] *= np.exp(change[:, :1])
             adjusted[:, 2 : 1 + change.shape[1]] += change[:, 1:]
-        turn, turn_jacobian = _small_turns(grid_pose[:, :3])
+        turn = rotation_matrices(grid_pose[:, :3])
         R, t = self.T_color_grid[:, :3, :3], self.T_color_grid[:, :3, 3]
         return Cameras(
             R_rig_camera=np.ascontiguousarray(T_rig_camera[:, :3, :3]),
@@ -175,7 +173,7 @@ class FactoryModels:
             raw_model=self.raw_model,
             bias=np.ascontiguousarray(bias),
             grid_turn=turn,
-            grid_turn_jacobian=turn_jacobian,
+            grid_turn_jacobian=right_jacobians(grid_pose[:, :3]),
         )
 
     def point_rows(self, seen: Observations) -> PointRows:
@@ -196,7 +194,11 @@ class FactoryModels:
 
     def plane_rows(self, seen: PlaneObservations) -> PlaneRows:
         """Observations as the compiled loops take them."""
-        distorted, rays, by_distorted = np.empty((len(seen), 2)), np.empty((len(seen), 2)), np.empty((len(seen), 2, 2))
+        distorted, rays, by_distorted = (
+            np.empty((len(seen), 2)),
+            np.empty((len(seen), 2)),
+            np.empty((len(seen), 2, 2)),
+        )
         for c in np.unique(seen.camera):
             here, intrinsics = seen.camera == c, self.grids[c].intrinsics
             distorted[here] = from_pixels(intrinsics, seen.grid_pixels[here])
@@ -224,25 +226,16 @@ class FactoryModels:
 def adjusted_intrinsics(color: Intrinsics, state: Array) -> Intrinsics:
     """Colour intrinsics with a camera's intrinsic state applied."""
     scale = float(np.exp(state[0]))
-    k1, *others = color.dist
+    k1, k2, p1, p2, k3 = color.dist
     return replace(
         color,
         fx=color.fx * scale,
         fy=color.fy * scale,
         cx=color.cx + float(state[1]),
         cy=color.cy + float(state[2]),
-        dist=(k1 + float(state[3]), *others),
+        dist=(k1 + float(state[3]), k2, p1, p2, k3),
     )
 
 
 def _numbers(intrinsics: Intrinsics) -> tuple[float, ...]:
     return (intrinsics.fx, intrinsics.fy, intrinsics.cx, intrinsics.cy, *intrinsics.dist)
-
-
-def _small_turns(phi: Array) -> tuple[Array, Array]:
-    """Exp (C,3,3) and right Jacobian (C,3,3) of rotation vectors (C,3) of some degrees, to fourth order."""
-    K = hat(phi)
-    square = K @ K
-    eye, cube, fourth = np.eye(3), square @ K, square @ square
-    turn = eye + K + square / 2.0 + cube / 6.0 + fourth / 24.0
-    return turn, eye - K / 2.0 + square / 6.0 - cube / 24.0 + fourth / 120.0

@@ -10,7 +10,7 @@ from rig_calib.bundle_adjustment import AdjustedCamera, Adjustment, adjust
 from rig_calib.depth_model import DepthCorrection, DepthGrid, depth_basis
 from rig_calib.matching import Matches
 from rig_calib.noise import NoiseModel, observed_noise
-from rig_calib.observation_model import CameraState
+from rig_calib.observation_model import GRID_INTRINSIC_TERMS, GRID_POSE_TERMS, CameraState
 from rig_calib.observed_camera import ObservedCamera
 from rig_calib.projection import from_pixels
 from rig_calib.settings import CalibrationSettings
@@ -22,25 +22,45 @@ from rig_protocol.rig_folder import RingDrawing
 
 Array = npt.NDArray[np.float64]
 
-@dataclass(frozen=True, slots=True)
-class _ModelSigma:
-    """How far a camera model may be off, one standard deviation.
 
-    Colour: relative focal length, principal point (px), k1. Depth grid against colour: rotation (rad), translation
-    (m); its own relative focal length and principal point (px).
+@dataclass(frozen=True, slots=True)
+class ModelSigma:
+    """How far a camera model may be off, as standard deviations; focal lengths as shares.
+
+    `grid_*` are the depth camera's, where depth comes on its own grid.
     """
 
-    color: tuple[float, float, float, float]
-    grid_pose: tuple[float, float]
-    grid: tuple[float, float, float]
+    focal: float
+    centre_px: float
+    k1: float
+    grid_turn_deg: float
+    grid_shift_m: float
+    grid_focal: float
+    grid_centre_px: float
+
+    @property
+    def intrinsics(self) -> Array:
+        """Of `CameraState.intrinsics`."""
+        return np.array([self.focal, self.centre_px, self.centre_px, self.k1])
+
+    @property
+    def grid_pose(self) -> Array:
+        """Of `CameraState.grid_pose`."""
+        return np.repeat([np.deg2rad(self.grid_turn_deg), self.grid_shift_m], 3)
+
+    @property
+    def grid_intrinsics(self) -> Array:
+        """Of `CameraState.grid_intrinsics`."""
+        return np.array([self.grid_focal, self.grid_centre_px, self.grid_centre_px])
 
 
-# Units differ from the common default by a percent and several pixels.
-_FACTORY = _ModelSigma((0.001, 0.6, 0.6, 0.001), (np.deg2rad(0.04), 0.0005), (0.001, 0.6, 0.6))
-_COMMON = _ModelSigma((0.01, 5.0, 5.0, 0.05), (np.deg2rad(1.0), 0.003), (0.01, 5.0, 5.0))
-_MODEL_SIGMA: Mapping[ModelSource, _ModelSigma] = {"factory": _FACTORY, "file": _FACTORY, "default": _COMMON}
-
-
+# Units differ from the common default by a percent, several pixels, and their lens's distortion.
+_MEASURED = ModelSigma(0.001, 0.6, 0.001, 0.04, 0.0005, 0.001, 0.6)
+_MODEL_SIGMA: Mapping[ModelSource, ModelSigma] = {
+    "factory": _MEASURED,
+    "file": _MEASURED,
+    "default": ModelSigma(0.01, 5.0, 0.1, 0.5, 0.003, 0.01, 5.0),
+}
 AT_REST = NoiseModel()
 
 
@@ -57,6 +77,12 @@ class AdjustedRig:
     def covariance_of(self, camera_id: int) -> Array:
         """Covariance (6,6) of one camera's pose in the adjustment's frame."""
         return self.covariance.of(self.scene.cameras.index(camera_id))
+
+    def aligned_covariances(self) -> dict[int, Array]:
+        """Covariance (6,6) of every camera's pose without the common turn and shift of the rig, by id."""
+        order = self.scene.cameras
+        aligned = self.covariance.aligned([self.poses[c] for c in order])
+        return {camera_id: aligned.of(k) for k, camera_id in enumerate(order)}
 
     def observed_noise(self) -> NoiseModel:
         """How noisy the capture turned out to be."""
@@ -105,9 +131,8 @@ def adjust_rig(
 def _adjusted_camera(
     camera: ObservedCamera, start: Pose, ring: RingDrawing | None, fixed: bool, settings: CalibrationSettings
 ) -> AdjustedCamera:
-    model = camera.view.model
+    model, own_grid = camera.view.model, camera.view.depth_frame == "depth"
     sigma = _MODEL_SIGMA[model.source]
-    has_grid = camera.view.depth_frame == "depth"  # else colour and depth share one camera
     pose_sigma = None
     if ring is not None:
         pose_sigma = np.repeat([np.deg2rad(ring.tolerance_deg), ring.tolerance_m], 3)
@@ -116,12 +141,13 @@ def _adjusted_camera(
         grid=camera.grid,
         start=CameraState(start, np.zeros(settings.bias_terms)),
         bias_sigma=_bias_sigma(camera.grid, settings),
-        intrinsics_sigma=np.array(sigma.color),
-        grid_pose_sigma=np.repeat(sigma.grid_pose, 3) * has_grid,
-        grid_intrinsics_sigma=np.array(sigma.grid) * has_grid,
+        intrinsics_sigma=sigma.intrinsics,
+        grid_pose_sigma=sigma.grid_pose if own_grid else np.zeros(GRID_POSE_TERMS),
+        grid_intrinsics_sigma=sigma.grid_intrinsics if own_grid else np.zeros(GRID_INTRINSIC_TERMS),
         T_prior=None if ring is None else camera.view.T_rig_nominal,
         pose_sigma=pose_sigma,
         fixed_pose=fixed,
+        gravity=camera.view.gravity,
     )
 
 

@@ -26,7 +26,7 @@ class CalibrationSettings(Settings):
     """`paper`: largest descriptor distance as a multiple of the smallest (table I of the paper)."""
     pixel_sigma: Positive = 0.25
     """Standard deviation of a small keypoint's position, pixels; large ones are placed less well."""
-    bias_terms: Annotated[int, Field(ge=0, le=6)] = 6
+    bias_terms: Annotated[int, Field(ge=0, le=10)] = 6
     """Depth-bias states of a camera: terms of `DepthCorrection`."""
     bias_scale_sigma: Positive = 0.015
     """Prior standard deviation of the depth scale."""

@@ -5,6 +5,7 @@ from dataclasses import dataclass
 
 import cv2
 import numpy as np
+import numpy.typing as npt
 
 from rig_protocol.camera import CameraModel
 from rig_protocol.frames import DepthFrame, ImageU8, ImageU16, PanoramicFrame, RgbdFrame
@@ -17,7 +18,8 @@ class CameraView:
     """Images of one camera over K panoramic frames, as delivered by the sensor.
 
     `color`: K images (H,W,3) BGR or (H,W) grey, u8. Depth, when there is any: K images of raw disparity
-    (`raw`, 2047 = none) or of millimetres (`depth_mm`, 0 = none) on the grid of `depth_frame`.
+    (`raw`, 2047 = none) or of millimetres (`depth_mm`, 0 = none) on the grid of `depth_frame`. `gravity`
+    (3,): unit vector down in the colour camera frame, where an accelerometer measured it.
     """
 
     camera_id: int
@@ -28,6 +30,7 @@ class CameraView:
     depth_mm: tuple[ImageU16, ...] = ()
     depth_frame: DepthFrame = "depth"
     T_rig_nominal: Pose | None = None
+    gravity: npt.NDArray[np.float64] | None = None
 
 
 def views_from_panoramas(

@@ -4,12 +4,15 @@ They run without the interpreter's lock and never reorder arithmetic: the same i
 """
 
 from collections.abc import Callable
-from typing import ParamSpec, TypeVar
+from typing import Any, ParamSpec, TypeVar
 
 import numba
 
 P = ParamSpec("P")
 R = TypeVar("R")
+
+# A division that may raise an error keeps loops from becoming vector instructions.
+_OPTIONS: dict[str, Any] = {"nogil": True, "error_model": "numpy"}
 
 
 def compiled(signature: object = None) -> Callable[[Callable[P, R]], Callable[P, R]]:
@@ -20,9 +23,9 @@ def compiled(signature: object = None) -> Callable[[Callable[P, R]], Callable[P,
 
     def compile_function(function: Callable[P, R]) -> Callable[P, R]:
         try:
-            machine_code: Callable[P, R] = numba.njit(signature, nogil=True, cache=True)(function)
+            machine_code: Callable[P, R] = numba.njit(signature, cache=True, **_OPTIONS)(function)
         except (RuntimeError, OSError):  # neither the installation nor the user's cache folder takes it
-            machine_code = numba.njit(signature, nogil=True)(function)
+            machine_code = numba.njit(signature, **_OPTIONS)(function)
         return machine_code
 
     return compile_function
@@ -30,5 +33,5 @@ def compiled(signature: object = None) -> Callable[[Callable[P, R]], Callable[P,
 
 def inlined(function: Callable[P, R]) -> Callable[P, R]:
     """Part of the compiled functions that call it."""
-    machine_code: Callable[P, R] = numba.njit(nogil=True)(function)
+    machine_code: Callable[P, R] = numba.njit(**_OPTIONS)(function)
     return machine_code

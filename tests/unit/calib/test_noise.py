@@ -3,7 +3,7 @@
 import numpy as np
 
 from rig_calib.noise import NoiseModel, observed_noise
-from rig_calib.observation_model import Observations
+from rig_calib.observation_model import Observations, isotropic_whitener
 
 RNG = np.random.default_rng(0)
 COUNT = 400
@@ -15,7 +15,7 @@ def observations() -> Observations:
         camera=np.zeros(COUNT, np.intp),
         point=np.arange(COUNT) // 2,
         pixels=GRID,
-        pixel_sigma=np.full(COUNT, 0.25),
+        pixel_whitener=isotropic_whitener(np.full(COUNT, 0.25)),
         disparity=np.full(COUNT, 800.0),
         slope=np.zeros((COUNT, 2)),
         grid_pixels=GRID,

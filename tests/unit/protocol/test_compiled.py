@@ -1,4 +1,4 @@
-"""The decoders compile wherever the program is installed."""
+"""Loops compile wherever the program is installed."""
 
 from collections.abc import Callable
 from typing import Any
@@ -6,11 +6,11 @@ from typing import Any
 import numba
 import pytest
 
-from rig_protocol.codecs import kernels
+from rig_protocol.compiled import compiled
 
 
 @pytest.mark.parametrize("error", [RuntimeError("no locator available"), OSError("read-only file system")])
-def test_an_installation_without_a_writable_cache_still_decodes(
+def test_an_installation_without_a_writable_cache_still_works(
     monkeypatch: pytest.MonkeyPatch, error: Exception
 ) -> None:
     def njit(*_: object, cache: bool = False, **__: object) -> Callable[[Any], Any]:
@@ -20,7 +20,7 @@ def test_an_installation_without_a_writable_cache_still_decodes(
 
     monkeypatch.setattr(numba, "njit", njit)
 
-    @kernels._compiled(numba.int64(numba.int64))
+    @compiled(numba.int64(numba.int64))
     def double(number: int) -> int:
         return 2 * number
 
