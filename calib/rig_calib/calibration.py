@@ -47,7 +47,6 @@ _GRADUATED_NOISE = tuple(
     for pixels, steps in ((1.0, 4.0), (1.0, 2.0), (1.0, 1.0), (1.0, 0.5), (1.0, 0.3), (0.3, 0.15))
 )
 _FAR_AND_WIDE_PX = 4.0  # predictions worse than this find false places, too
-DEBUG=None
 # Fewer patches that were found far from where the drawing has them may agree by chance.
 _MIN_PATCHES = 20
 _NO_MATCHES: Matches = np.empty((0, 2), dtype=np.intp)
@@ -204,7 +203,6 @@ def _solve_jointly(
         matches = _verified(refined, far - depth_only, prediction_px, settings)
         noise = _GRADUATED_NOISE[k] if far and k < len(_GRADUATED_NOISE) else AT_REST
         rig = adjust_rig(refined.cameras, matches, before, ring, settings, noise)
-        if DEBUG: DEBUG(k,rig,matches,prediction_px)
         if noise is AT_REST and _largest_shift_px(before, rig.poses, regions) < _SETTLED_PX:
             break
     rig = adjust_rig(refined.cameras, matches, rig.poses, ring, settings, rig.observed_noise())

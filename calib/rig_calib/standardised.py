@@ -32,9 +32,14 @@ class StandardisedResiduals:
         residual keeps the part 1 − w/Σw of its variance. The cameras' own states are few beside the points.
         """
         seen = rig.scene.observations
-        pixel = _redundancy(seen.point, seen.pixel_sigma)
-        disparity = _redundancy(seen.point, seen.disparity_sigma)
-        redundancy = np.column_stack([pixel, pixel, disparity])
+        known = np.isfinite(seen.disparity_sigma)
+        disparity = np.divide(1.0, seen.disparity_sigma**2, out=np.zeros(len(seen)), where=known)
+        pixel = np.square(seen.pixel_whitener).sum(axis=2)  # of both directions that the residuals are along
+        weights = np.column_stack([pixel, disparity])
+        shared = np.column_stack([pixel.mean(axis=1), pixel.mean(axis=1), disparity])
+        redundancy = np.column_stack(
+            [_redundancy(seen.point, weights[:, k], shared[:, k]) for k in range(weights.shape[1])]
+        )
         redundancy[~(redundancy > _MIN_REDUNDANCY)] = np.nan
         ids = np.array(rig.scene.cameras, dtype=np.intp)
         return cls(rig.adjustment.residuals / np.sqrt(redundancy), ids[seen.camera], seen.point)
@@ -47,10 +52,13 @@ class StandardisedResiduals:
         return _finite(self.values[rows, :2]), _finite(self.values[rows, 2])
 
 
-def _redundancy(point: Index, sigma: Array) -> Array:
-    """1 − w/Σw (M,) with the sum over a point's measurements; NaN where there is no measurement."""
-    weight = np.where(np.isfinite(sigma), 1.0 / np.square(sigma), 0.0)
-    total = np.bincount(point, weight)[point]
+def _redundancy(point: Index, weight: Array, shared: Array) -> Array:
+    """1 − w/(w + the others' weight) (M,) over a point's measurements; NaN where there is no measurement.
+
+    `shared` (M,) is what each adds to the point for the others: for a pixel the mean of its two directions.
+    """
+    others = np.bincount(point, shared)[point] - shared
+    total = weight + others
     return np.where(weight > 0.0, 1.0 - weight / np.where(total > 0.0, total, 1.0), np.nan)
 
 
