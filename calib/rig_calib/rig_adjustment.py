@@ -1,6 +1,6 @@
 """The joint estimate: all poses, points and depth-bias states of observed cameras in one adjustment."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -24,7 +24,7 @@ Array = npt.NDArray[np.float64]
 
 # How far factory, measured and assumed colour intrinsics may be off: relative focal length, principal
 # point in pixels. Units differ from the common default by a percent and several pixels.
-_INTRINSICS_SIGMA: Mapping[ModelSource, tuple[float, float, float]] = {
+INTRINSICS_SIGMA: Mapping[ModelSource, tuple[float, float, float]] = {
     "factory": (0.001, 0.6, 0.6),
     "file": (0.001, 0.6, 0.6),
     "default": (0.01, 5.0, 5.0),
@@ -47,6 +47,12 @@ class AdjustedRig:
     def covariance_of(self, camera_id: int) -> Array:
         """Covariance (6,6) of one camera's pose in the adjustment's frame."""
         return self.covariance.of(self.scene.cameras.index(camera_id))
+
+    def joint_covariance(self, camera_ids: Sequence[int]) -> Array:
+        """Covariance (6N,6N) of N cameras' poses in the adjustment's frame, in the order of their ids."""
+        rows = [self.scene.cameras.index(camera_id) for camera_id in camera_ids]
+        blocks = self.covariance.blocks[rows][:, :, rows]
+        return np.ascontiguousarray(blocks.reshape(6 * len(rows), 6 * len(rows)))
 
     def observed_noise(self) -> NoiseModel:
         """How noisy the capture turned out to be."""
@@ -103,15 +109,15 @@ def _adjusted_camera(
         color=model.color,
         grid=camera.grid,
         start=CameraState(start, np.zeros(settings.bias_terms), np.zeros(3)),
-        bias_sigma=_bias_sigma(camera.grid, settings),
-        intrinsics_sigma=np.array(_INTRINSICS_SIGMA[model.source]),
+        bias_sigma=bias_sigma(camera.grid, settings),
+        intrinsics_sigma=np.array(INTRINSICS_SIGMA[model.source]),
         T_prior=None if ring is None else camera.view.T_rig_nominal,
         pose_sigma=pose_sigma,
         fixed_pose=fixed,
     )
 
 
-def _bias_sigma(grid: DepthGrid, settings: CalibrationSettings) -> Array:
+def bias_sigma(grid: DepthGrid, settings: CalibrationSettings) -> Array:
     """Prior standard deviations of the bias terms: the scale's, and shapes of one height over the image."""
     across = np.linspace(0, grid.intrinsics.width - 1, 3), np.linspace(0, grid.intrinsics.height - 1, 3)
     x, y = from_pixels(grid.intrinsics, np.stack(np.meshgrid(*across), axis=-1).reshape(-1, 2)).T

@@ -10,10 +10,11 @@ import numpy as np
 import numpy.typing as npt
 
 from rig_calib.depth_model import DepthCorrection
+from rig_calib.uncertainty import PoseCovariance
 from rig_calib.whole_file import whole_file
 from rig_protocol.camera import as_pose
 from rig_protocol.errors import DataError
-from rig_protocol.poses import Pose
+from rig_protocol.poses import Pose, inverse
 from rig_protocol.rig_folder import read_json
 
 SCHEMA = 1
@@ -128,7 +129,9 @@ class LoopClosure:
 class RigCalibration:
     """Where every colour camera of the rig is, how well that is known, and from what it was found.
 
-    `failures` are the reasons why the result does not pass its own gate; empty means it passes.
+    `joint_covariance` (6N,6N) is that of all N poses, in the order of `cameras`: the covariance of every pair
+    follows from it. `failures` are the reasons why the result does not pass its own gate; empty means it
+    passes.
     """
 
     method: str
@@ -142,6 +145,7 @@ class RigCalibration:
     provenance: Mapping[str, Any] = field(default_factory=dict)
     warnings: tuple[str, ...] = ()
     failures: tuple[str, ...] = ()
+    joint_covariance: npt.NDArray[np.float64] | None = None
 
     @property
     def poses(self) -> dict[int, Pose]:
@@ -151,6 +155,15 @@ class RigCalibration:
     def camera(self, camera_id: int) -> CalibratedCamera | None:
         """The camera with this id, or None when the calibration could not place it."""
         return next((camera for camera in self.cameras if camera.id == camera_id), None)
+
+    def relative_covariance(self, i: int, j: int) -> npt.NDArray[np.float64] | None:
+        """Covariance (6,6) of T_i_j, on its right; None without a pose, or when the method gives none."""
+        order = [camera.id for camera in self.cameras]
+        if self.joint_covariance is None or i not in order or j not in order:
+            return None
+        blocks = PoseCovariance(self.joint_covariance.reshape(len(order), 6, len(order), 6))
+        T_i_j = inverse(self.poses[i]) @ self.poses[j]
+        return blocks.relative(order.index(i), order.index(j), T_i_j)
 
     def to_dict(self) -> dict[str, Any]:
         """The `calibration.json` form."""
@@ -167,6 +180,7 @@ class RigCalibration:
             "frames_used": self.frames_used,
             "warnings": list(self.warnings),
             "failures": list(self.failures),
+            "joint_covariance": None if self.joint_covariance is None else self.joint_covariance.tolist(),
         }
 
     @classmethod
@@ -175,11 +189,13 @@ class RigCalibration:
         if not isinstance(values, Mapping) or values.get("schema") != SCHEMA:
             raise DataError(f"not a calibration of schema {SCHEMA}; make a new one with `rig-calib solve`")
         try:
-            loop = values.get("loop_closure")
+            loop, joint = values.get("loop_closure"), values.get("joint_covariance")
+            cameras = tuple(map(CalibratedCamera.from_dict, values["cameras"]))
+            size = 6 * len(cameras)
             return cls(
                 method=str(values["method"]),
                 rig_frame=str(values["rig_frame"]),
-                cameras=tuple(map(CalibratedCamera.from_dict, values["cameras"])),
+                cameras=cameras,
                 edges=tuple(map(CalibratedEdge.from_dict, values["edges"])),
                 loop_closure=None if loop is None else LoopClosure.from_dict(loop),
                 seconds={str(key): float(value) for key, value in values["seconds"].items()},
@@ -188,6 +204,7 @@ class RigCalibration:
                 provenance=dict(values.get("provenance", {})),
                 warnings=tuple(map(str, values.get("warnings", ()))),
                 failures=tuple(map(str, values.get("failures", ()))),
+                joint_covariance=None if joint is None else np.array(joint, np.float64).reshape(size, size),
             )
         except (AttributeError, KeyError, TypeError, ValueError) as error:
             raise DataError(f"malformed calibration: {error!r}") from error
