@@ -47,7 +47,8 @@ class PairSupport:
         """For people: "overlap cam03–cam04: 6 matches, ±12 mm: hang a pattern ..."."""
         parts = [f"{self.matches} match" + "es" * (self.matches != 1)]
         if self.expected is not None:
-            parts.append(f"±{self.expected.deg:.2f}° ±{self.expected.mm:.0f} mm")
+            mm = self.expected.mm
+            parts.append(f"±{self.expected.deg:.2f}° ±{mm:.{int(mm < 10.0)}f} mm")
         return f"overlap {self.name}: {', '.join(parts)}" + (f": {self.advice}" if self.advice else "")
 
 

@@ -63,14 +63,14 @@ def contradictions(
     accused = _accused(around, others, known, settings)
     if accused:
         return [
-            f"camera {camera_id} ({names[camera_id]}) stands {told} from where the calibration has it, as its "
-            "other neighbour sees it: it has moved, too; calibrate the whole rig"
+            f"camera {camera_id} ({names[camera_id]}) stands {told} from where the calibration has it, as "
+            "its other neighbour sees it: it has moved, too; calibrate the whole rig"
             for camera_id, told in accused.items()
         ]
     return [
-        f"cameras {i} ({names[i]}) and {j} ({names[j]}), both seen from {camera.name}, stand {told} from "
-        "where the calibration has them: one of them has moved, too, or matches are false; calibrate the "
-        "whole rig"
+        f"cameras {i} ({names[i]}) and {j} ({names[j]}), both seen from {camera.name}, stand {told} "
+        "from where the calibration has them: one of them has moved, too, or matches are false; calibrate "
+        "the whole rig"
         for (i, j), told in through.items()
     ]
 
