@@ -23,9 +23,11 @@ def coached_capture(rig: Rig, task: CalibrationTask, display: CoachDisplay) -> E
     with BackgroundWork[Estimate]("calibration") as work:
         while True:
             estimate = _Round(rig, task, display, work).run()
-            if not task.coached or task.contents(estimate) or rig.ended:
+            if not task.coached or task.contents(estimate):
                 return estimate
             _skip_waiting_sets(rig)
+            if rig.ended:  # nobody can hang a pattern into a recording
+                return estimate
 
 
 class _Round:
