@@ -22,7 +22,7 @@ from rig_calib.pose_graph import loop_error
 from rig_calib.rig_calibration import CalibratedCamera, CalibratedEdge, LoopClosure, RigCalibration
 from rig_calib.settings import CalibrationSettings
 from rig_calib.stages import Progress
-from rig_calib.uncertainty import weakest_direction
+from rig_calib.uncertainty import PoseCovariance, weakest_direction
 from rig_calib.view import CameraView
 from rig_protocol.errors import ConfigurationError
 from rig_protocol.poses import Pose, inverse
@@ -170,17 +170,24 @@ def _merged(
     joint = _joint_covariance(known, ids)
     if joint is not None:
         joint = _extended(joint, [ids.index(c) for c in held.held], held)
-        camera = replace(camera, covariance=np.ascontiguousarray(joint[-6:, -6:]))
+        poses = [*(known.poses[camera_id] for camera_id in ids), camera.T_rig_camera]
+        aligned = PoseCovariance(joint.reshape(len(poses), 6, len(poses), 6)).aligned(poses)
+        camera = replace(
+            camera,
+            covariance=np.ascontiguousarray(joint[-6:, -6:]),
+            aligned_covariance=aligned.of(len(ids)),
+        )
     cameras = (*(one for one in known.cameras if one.id != camera.id), camera)
     order = sorted(range(len(cameras)), key=lambda k: cameras[k].id)
-    kept = [edge for edge in known.edges if camera.id not in (edge.i, edge.j)]
-    all_edges = tuple(sorted([*kept, *edges], key=lambda edge: (edge.i, edge.j)))
-    merged = replace(known, cameras=tuple(cameras[k] for k in order), edges=all_edges)
-    return replace(
-        merged,
-        loop_closure=_loop_closure(all_edges, merged.poses),
+    merged = replace(
+        known,
+        cameras=tuple(cameras[k] for k in order),
         joint_covariance=None if joint is None else _blocks(joint, order, order),
     )
+    kept = [edge for edge in known.edges if camera.id not in (edge.i, edge.j)]
+    own = [replace(edge, relative_covariance=merged.relative_covariance(edge.i, edge.j)) for edge in edges]
+    all_edges = tuple(sorted([*kept, *own], key=lambda edge: (edge.i, edge.j)))
+    return replace(merged, edges=all_edges, loop_closure=_loop_closure(all_edges, merged.poses))
 
 
 def _joint_covariance(known: RigCalibration, camera_ids: Sequence[int]) -> Array | None:

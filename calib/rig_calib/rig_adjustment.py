@@ -54,6 +54,12 @@ class AdjustedRig:
         blocks = self.covariance.blocks[rows][:, :, rows]
         return np.ascontiguousarray(blocks.reshape(6 * len(rows), 6 * len(rows)))
 
+    def aligned_covariances(self) -> dict[int, Array]:
+        """Covariance (6,6) of every camera's pose without the common turn and shift of the rig, by id."""
+        order = self.scene.cameras
+        aligned = self.covariance.aligned([self.poses[c] for c in order])
+        return {camera_id: aligned.of(k) for k, camera_id in enumerate(order)}
+
     def observed_noise(self) -> NoiseModel:
         """How noisy the capture turned out to be."""
         return observed_noise(self.scene.observations, self.adjustment.residuals, len(self.scene.points))

@@ -22,7 +22,10 @@ SCHEMA = 1
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CalibratedCamera:
-    """Pose of one colour camera: T_true = T_rig_camera · Exp(δ), δ ~ N(0, covariance), rotation first."""
+    """Pose of one colour camera: T_true = T_rig_camera · Exp(δ), δ ~ N(0, covariance), rotation first.
+
+    `aligned_covariance` is that of δ without the common turn and shift of the whole rig against its frame.
+    """
 
     id: int
     name: str
@@ -30,6 +33,7 @@ class CalibratedCamera:
     covariance: npt.NDArray[np.float64] | None = None
     depth_correction: DepthCorrection | None = None
     serial: str | None = None
+    aligned_covariance: npt.NDArray[np.float64] | None = None
 
     def to_dict(self) -> dict[str, Any]:
         """One item of `cameras`."""
@@ -38,27 +42,32 @@ class CalibratedCamera:
             "name": self.name,
             "serial": self.serial,
             "T_rig_camera": self.T_rig_camera.tolist(),
-            "covariance": None if self.covariance is None else self.covariance.tolist(),
+            "covariance": _listed(self.covariance),
+            "aligned_covariance": _listed(self.aligned_covariance),
             "depth_correction": None if self.depth_correction is None else self.depth_correction.to_dict(),
         }
 
     @classmethod
     def from_dict(cls, values: Mapping[str, Any]) -> "CalibratedCamera":
         """Read one item of `cameras`."""
-        covariance, correction = values.get("covariance"), values.get("depth_correction")
+        correction = values.get("depth_correction")
         return cls(
             id=int(values["id"]),
             name=str(values["name"]),
             T_rig_camera=as_pose(values["T_rig_camera"], "T_rig_camera"),
-            covariance=None if covariance is None else np.array(covariance, dtype=np.float64).reshape(6, 6),
+            covariance=_as_covariance(values.get("covariance")),
             depth_correction=None if correction is None else DepthCorrection.from_dict(correction),
             serial=values.get("serial"),
+            aligned_covariance=_as_covariance(values.get("aligned_covariance")),
         )
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CalibratedEdge:
-    """One pair of cameras with a common view; `T_i_j` is what this edge alone measured."""
+    """One pair of cameras with a common view; `T_i_j` is what this edge alone measured.
+
+    `relative_covariance` (6,6) is of the calibration's own inverse(T_rig_i) · T_rig_j, on its right.
+    """
 
     i: int
     j: int
@@ -68,6 +77,7 @@ class CalibratedEdge:
     T_i_j: Pose
     used: bool
     reason: str | None = None
+    relative_covariance: npt.NDArray[np.float64] | None = None
 
     def to_dict(self) -> dict[str, Any]:
         """One item of `edges`."""
@@ -80,6 +90,7 @@ class CalibratedEdge:
             "T_i_j": self.T_i_j.tolist(),
             "used": self.used,
             "reason": self.reason,
+            "relative_covariance": _listed(self.relative_covariance),
         }
 
     @classmethod
@@ -94,6 +105,7 @@ class CalibratedEdge:
             as_pose(values["T_i_j"], "T_i_j"),
             bool(values["used"]),
             values.get("reason"),
+            _as_covariance(values.get("relative_covariance")),
         )
 
 
@@ -180,7 +192,7 @@ class RigCalibration:
             "frames_used": self.frames_used,
             "warnings": list(self.warnings),
             "failures": list(self.failures),
-            "joint_covariance": None if self.joint_covariance is None else self.joint_covariance.tolist(),
+            "joint_covariance": _listed(self.joint_covariance),
         }
 
     @classmethod
@@ -189,9 +201,8 @@ class RigCalibration:
         if not isinstance(values, Mapping) or values.get("schema") != SCHEMA:
             raise DataError(f"not a calibration of schema {SCHEMA}; make a new one with `rig-calib solve`")
         try:
-            loop, joint = values.get("loop_closure"), values.get("joint_covariance")
+            loop = values.get("loop_closure")
             cameras = tuple(map(CalibratedCamera.from_dict, values["cameras"]))
-            size = 6 * len(cameras)
             return cls(
                 method=str(values["method"]),
                 rig_frame=str(values["rig_frame"]),
@@ -204,7 +215,7 @@ class RigCalibration:
                 provenance=dict(values.get("provenance", {})),
                 warnings=tuple(map(str, values.get("warnings", ()))),
                 failures=tuple(map(str, values.get("failures", ()))),
-                joint_covariance=None if joint is None else np.array(joint, np.float64).reshape(size, size),
+                joint_covariance=_as_covariance(values.get("joint_covariance"), 6 * len(cameras)),
             )
         except (AttributeError, KeyError, TypeError, ValueError) as error:
             raise DataError(f"malformed calibration: {error!r}") from error
@@ -221,3 +232,17 @@ class RigCalibration:
             return cls.from_dict(read_json(path))
         except DataError as error:
             raise DataError(f"{path}: {error}") from error
+
+
+def _listed(covariance: npt.NDArray[np.float64] | None) -> list[list[float]] | None:
+    return None if covariance is None else covariance.tolist()
+
+
+def _as_covariance(values: Any, size: int = 6) -> npt.NDArray[np.float64] | None:
+    """A covariance (size,size) from its list, None of None; ValueError when it cannot be one."""
+    if values is None:
+        return None
+    covariance = np.array(values, dtype=np.float64).reshape(size, size)
+    if not np.isfinite(covariance).all() or not np.allclose(covariance, covariance.T):
+        raise ValueError(f"a covariance is a finite, symmetric {size}x{size} matrix")
+    return covariance

@@ -106,6 +106,10 @@ def test_its_covariance_holds_the_uncertainty_of_those_it_hangs_on(capture: Capt
     assert np.trace(relative[rotation, rotation]) < 0.2 * own
     e = se3_log(inverse(camera.T_rig_camera) @ capture.rig.truth[MOVED])
     assert e @ np.linalg.solve(camera.covariance, e) < CONSISTENT
+    assert camera.aligned_covariance is not None
+    assert np.trace(camera.aligned_covariance[rotation, rotation]) < 0.2 * own
+    edge = next(edge for edge in found.edges if (edge.i, edge.j) == (MOVED, MOVED + 1))
+    np.testing.assert_array_equal(edge.relative_covariance, found.relative_covariance(MOVED, MOVED + 1))
     joint = found.joint_covariance
     assert joint is not None
     assert np.linalg.eigvalsh(joint)[0] > 0.0
