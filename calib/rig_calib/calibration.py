@@ -131,6 +131,9 @@ def calibrate(
         provenance={"settings": settings.model_dump(mode="json")},
         warnings=tuple(warnings),
         failures=tuple(failures),
+        joint_covariance=None
+        if solution.rig is None
+        else solution.rig.joint_covariance(_placed(views, solution)),
     )
     evidence = tuple(edge_evidence(solution.cameras, solution.edges, solution.poses, solution.rig))
     return CalibrationResult(calibration, evidence, before, solution.rig)
@@ -332,6 +335,10 @@ def _calibrated_cameras(views: Sequence[CameraView], solution: _Solution) -> tup
         for view in views
         if view.camera_id in solution.poses
     )
+
+
+def _placed(views: Sequence[CameraView], solution: _Solution) -> list[int]:
+    return [view.camera_id for view in views if view.camera_id in solution.poses]
 
 
 def _calibrated_edge(edge: Edge, rig: AdjustedRig | None) -> CalibratedEdge:

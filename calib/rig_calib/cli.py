@@ -16,6 +16,8 @@ _EXAMPLES = """
 
 `rig-calib solve captures/office --out results` — calibrate a rig folder, write calibration, report, cloud
 
+`rig-calib solve captures/now --recalibrate cam04 --out results` — one camera moved: find it, keep the others
+
 `rig-calib evaluate results/calibration.json captures/office/truth.json` — errors against known poses
 
 `rig-calib fuse captures/hall --calibration results/calibration.json --out hall` — fuse another capture
@@ -53,13 +55,23 @@ def solve(
     ] = None,
     frames: Frames = None,
     seed: Annotated[int | None, typer.Option(help="Of every random choice.")] = None,
+    recalibrate: Annotated[
+        str | None,
+        typer.Option(metavar="CAMERA", help="Find this one (name or id) anew, keep all others as they are."),
+    ] = None,
+    calibration: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="With --recalibrate; default: that of --out.")
+    ] = None,
     as_json: AsJson = False,
 ) -> None:
-    """Calibrate a rig folder; exit 1 when the result fails its quality gate, with the files still written."""
+    """Calibrate a rig folder; exit 1 when the result fails its quality gate, with the files still written.
+
+    With `--recalibrate` a calibration.json that is overwritten stays as calibration-before.json.
+    """
     from rich.console import Console
 
-    from rig_calib.outputs import make_output_folder, write_outputs
-    from rig_calib.rig_folder_calibration import solve_folder
+    from rig_calib.outputs import keep_before, known_calibration, make_output_folder, write_outputs
+    from rig_calib.rig_folder_calibration import recalibrate_folder, solve_folder
     from rig_calib.settings import CalibrationSettings
     from rig_calib.terminal import calibration_tables, progress_bar
     from rig_protocol.errors import RigError
@@ -67,10 +79,15 @@ def solve(
 
     set_up_logging("WARNING")
     settings = load_settings(CalibrationSettings, None, "RIG_CALIB_", {"method": method, "seed": seed})
+    known = known_calibration(recalibrate, calibration, out)
     make_output_folder(out)
     console = Console(quiet=as_json, highlight=False)
     with progress_bar(console) as tell:
-        result, views = solve_folder(folder, settings, frames, tell)
+        if recalibrate is None or known is None:
+            result, views = solve_folder(folder, settings, frames, tell)
+        else:
+            result, views = recalibrate_folder(folder, known, recalibrate, settings, frames, tell)
+            keep_before(out)
         write_outputs(out, result.calibration, views, result.evidence, result.poses_before, tell)
     console.print(calibration_tables(result.calibration, views))
     if as_json:

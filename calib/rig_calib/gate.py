@@ -15,7 +15,7 @@ from rig_protocol.poses import Pose, inverse, rotation_angle_deg
 from rig_protocol.rig_folder import RingDrawing
 
 _FAR = 5.0  # in tolerances of one axis; three axes together rarely exceed four
-_MORE_MATCHES = "put patterns or textured things where both look, 0.8 to 3 m away, where both have depth"
+MORE_MATCHES = "put patterns or textured things where both look, 0.8 to 3 m away, where both have depth"
 
 
 def unplaced(views: Sequence[CameraView], edges: Sequence[Edge], placed: Mapping[int, Pose]) -> list[str]:
@@ -59,7 +59,7 @@ def unsupported(
         if drawn and (sigma_deg > settings.max_edge_sigma_deg or sigma_m > settings.max_edge_sigma_m):
             failures.append(
                 f"{told}; without it their relative pose is only known to {sigma_deg:.1f}° and "
-                f"{sigma_m * 1e3:.0f} mm: {_MORE_MATCHES}"
+                f"{sigma_m * 1e3:.0f} mm: {MORE_MATCHES}"
             )
         elif drawn or (edge.T_i_j is not None and edge.inlier.sum() >= 2 * settings.min_inliers):
             warnings.append(told)
@@ -109,4 +109,4 @@ def _unconnected(view: CameraView, edges: Sequence[Edge], names: Mapping[int, st
     best = max(own, key=lambda edge: (int(edge.inlier.sum()), len(edge.matches)))
     other = best.j if best.i == view.camera_id else best.i
     why = best.reason or "its partners are not connected either"
-    return f"{told}; its best partner is camera {other} ({names[other]}), but {why}: {_MORE_MATCHES}"
+    return f"{told}; its best partner is camera {other} ({names[other]}), but {why}: {MORE_MATCHES}"

@@ -10,8 +10,11 @@ from rig_calib.fusion.ply import write_ply
 from rig_calib.report import write_report
 from rig_calib.rig_calibration import RigCalibration
 from rig_calib.view import CameraView
+from rig_calib.whole_file import whole_file
 from rig_protocol.errors import ConfigurationError
 from rig_protocol.poses import Pose
+
+NAME, BEFORE = "calibration.json", "calibration-before.json"
 
 
 def make_output_folder(folder: Path) -> None:
@@ -23,6 +26,31 @@ def make_output_folder(folder: Path) -> None:
         probe.unlink()
     except OSError as error:
         raise ConfigurationError(f"cannot write to {folder}: {error.strerror}") from error
+
+
+def known_calibration(recalibrate: str | None, file: Path | None, folder: Path) -> RigCalibration | None:
+    """The calibration that `--recalibrate` starts from: the given file, else that of the output folder.
+
+    None without `--recalibrate`. ConfigurationError for a file without it, or when there is none.
+    """
+    if recalibrate is None:
+        if file is not None:
+            raise ConfigurationError("--calibration needs --recalibrate CAMERA")
+        return None
+    path = file or folder / NAME
+    if not path.is_file():
+        raise ConfigurationError(
+            f"--recalibrate {recalibrate} needs a calibration of the rig, and there is no {path}: name one "
+            "with --calibration FILE, or calibrate the whole rig"
+        )
+    return RigCalibration.load(path)
+
+
+def keep_before(folder: Path) -> None:
+    """Copy a calibration.json that is about to be written anew to calibration-before.json."""
+    if (folder / NAME).is_file():
+        with whole_file(folder / BEFORE) as file:
+            file.write((folder / NAME).read_bytes())
 
 
 def write_outputs(
@@ -39,7 +67,7 @@ def write_outputs(
     placed.
     """
     tell = progress or (lambda _stage, _share: None)
-    calibration.save(folder / "calibration.json")
+    calibration.save(folder / NAME)
     tell("fusion", 0.0)
     fused = write_fused(folder, calibration, views)
     tell("report", 0.5)

@@ -1,6 +1,6 @@
 """The joint estimate: all poses, points and depth-bias states of observed cameras in one adjustment."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -56,7 +56,7 @@ class ModelSigma:
 
 # Units differ from the common default by a percent, several pixels, and their lens's distortion.
 _MEASURED = ModelSigma(0.001, 0.6, 0.001, 0.04, 0.0005, 0.001, 0.6)
-_MODEL_SIGMA: Mapping[ModelSource, ModelSigma] = {
+MODEL_SIGMA: Mapping[ModelSource, ModelSigma] = {
     "factory": _MEASURED,
     "file": _MEASURED,
     "default": ModelSigma(0.01, 5.0, 0.1, 0.5, 0.003, 0.01, 5.0),
@@ -77,6 +77,12 @@ class AdjustedRig:
     def covariance_of(self, camera_id: int) -> Array:
         """Covariance (6,6) of one camera's pose in the adjustment's frame."""
         return self.covariance.of(self.scene.cameras.index(camera_id))
+
+    def joint_covariance(self, camera_ids: Sequence[int]) -> Array:
+        """Covariance (6N,6N) of N cameras' poses in the adjustment's frame, in the order of their ids."""
+        rows = [self.scene.cameras.index(camera_id) for camera_id in camera_ids]
+        blocks = self.covariance.blocks[rows][:, :, rows]
+        return np.ascontiguousarray(blocks.reshape(6 * len(rows), 6 * len(rows)))
 
     def aligned_covariances(self) -> dict[int, Array]:
         """Covariance (6,6) of every camera's pose without the common turn and shift of the rig, by id."""
@@ -132,7 +138,7 @@ def _adjusted_camera(
     camera: ObservedCamera, start: Pose, ring: RingDrawing | None, fixed: bool, settings: CalibrationSettings
 ) -> AdjustedCamera:
     model, own_grid = camera.view.model, camera.view.depth_frame == "depth"
-    sigma = _MODEL_SIGMA[model.source]
+    sigma = MODEL_SIGMA[model.source]
     pose_sigma = None
     if ring is not None:
         pose_sigma = np.repeat([np.deg2rad(ring.tolerance_deg), ring.tolerance_m], 3)
@@ -140,7 +146,7 @@ def _adjusted_camera(
         color=model.color,
         grid=camera.grid,
         start=CameraState(start, np.zeros(settings.bias_terms)),
-        bias_sigma=_bias_sigma(camera.grid, settings),
+        bias_sigma=bias_sigma(camera.grid, settings),
         intrinsics_sigma=sigma.intrinsics,
         grid_pose_sigma=sigma.grid_pose if own_grid else np.zeros(GRID_POSE_TERMS),
         grid_intrinsics_sigma=sigma.grid_intrinsics if own_grid else np.zeros(GRID_INTRINSIC_TERMS),
@@ -151,7 +157,7 @@ def _adjusted_camera(
     )
 
 
-def _bias_sigma(grid: DepthGrid, settings: CalibrationSettings) -> Array:
+def bias_sigma(grid: DepthGrid, settings: CalibrationSettings) -> Array:
     """Prior standard deviations of the bias terms: the scale's, and shapes of one height over the image."""
     across = np.linspace(0, grid.intrinsics.width - 1, 3), np.linspace(0, grid.intrinsics.height - 1, 3)
     x, y = from_pixels(grid.intrinsics, np.stack(np.meshgrid(*across), axis=-1).reshape(-1, 2)).T

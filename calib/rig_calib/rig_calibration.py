@@ -10,10 +10,11 @@ import numpy as np
 import numpy.typing as npt
 
 from rig_calib.depth_model import DepthCorrection
+from rig_calib.uncertainty import PoseCovariance
 from rig_calib.whole_file import whole_file
 from rig_protocol.camera import as_pose
 from rig_protocol.errors import DataError
-from rig_protocol.poses import Pose
+from rig_protocol.poses import Pose, inverse
 from rig_protocol.rig_folder import read_json
 
 SCHEMA = 1
@@ -140,7 +141,9 @@ class LoopClosure:
 class RigCalibration:
     """Where every colour camera of the rig is, how well that is known, and from what it was found.
 
-    `failures` are the reasons why the result does not pass its own gate; empty means it passes.
+    `joint_covariance` (6N,6N) is that of all N poses, in the order of `cameras`: the covariance of every pair
+    follows from it. `failures` are the reasons why the result does not pass its own gate; empty means it
+    passes.
     """
 
     method: str
@@ -154,6 +157,7 @@ class RigCalibration:
     provenance: Mapping[str, Any] = field(default_factory=dict)
     warnings: tuple[str, ...] = ()
     failures: tuple[str, ...] = ()
+    joint_covariance: npt.NDArray[np.float64] | None = None
 
     @property
     def poses(self) -> dict[int, Pose]:
@@ -163,6 +167,15 @@ class RigCalibration:
     def camera(self, camera_id: int) -> CalibratedCamera | None:
         """The camera with this id, or None when the calibration could not place it."""
         return next((camera for camera in self.cameras if camera.id == camera_id), None)
+
+    def relative_covariance(self, i: int, j: int) -> npt.NDArray[np.float64] | None:
+        """Covariance (6,6) of T_i_j, on its right; None without a pose, or when the method gives none."""
+        order = [camera.id for camera in self.cameras]
+        if self.joint_covariance is None or i not in order or j not in order:
+            return None
+        blocks = PoseCovariance(self.joint_covariance.reshape(len(order), 6, len(order), 6))
+        T_i_j = inverse(self.poses[i]) @ self.poses[j]
+        return blocks.relative(order.index(i), order.index(j), T_i_j)
 
     def to_dict(self) -> dict[str, Any]:
         """The `calibration.json` form."""
@@ -179,6 +192,7 @@ class RigCalibration:
             "frames_used": self.frames_used,
             "warnings": list(self.warnings),
             "failures": list(self.failures),
+            "joint_covariance": _listed(self.joint_covariance),
         }
 
     @classmethod
@@ -188,10 +202,11 @@ class RigCalibration:
             raise DataError(f"not a calibration of schema {SCHEMA}; make a new one with `rig-calib solve`")
         try:
             loop = values.get("loop_closure")
+            cameras = tuple(map(CalibratedCamera.from_dict, values["cameras"]))
             return cls(
                 method=str(values["method"]),
                 rig_frame=str(values["rig_frame"]),
-                cameras=tuple(map(CalibratedCamera.from_dict, values["cameras"])),
+                cameras=cameras,
                 edges=tuple(map(CalibratedEdge.from_dict, values["edges"])),
                 loop_closure=None if loop is None else LoopClosure.from_dict(loop),
                 seconds={str(key): float(value) for key, value in values["seconds"].items()},
@@ -200,6 +215,7 @@ class RigCalibration:
                 provenance=dict(values.get("provenance", {})),
                 warnings=tuple(map(str, values.get("warnings", ()))),
                 failures=tuple(map(str, values.get("failures", ()))),
+                joint_covariance=_as_covariance(values.get("joint_covariance"), 6 * len(cameras)),
             )
         except (AttributeError, KeyError, TypeError, ValueError) as error:
             raise DataError(f"malformed calibration: {error!r}") from error
@@ -222,11 +238,11 @@ def _listed(covariance: npt.NDArray[np.float64] | None) -> list[list[float]] | N
     return None if covariance is None else covariance.tolist()
 
 
-def _as_covariance(values: Any) -> npt.NDArray[np.float64] | None:
-    """A covariance (6,6) from its list, None of None; ValueError when it cannot be one."""
+def _as_covariance(values: Any, size: int = 6) -> npt.NDArray[np.float64] | None:
+    """A covariance (size,size) from its list, None of None; ValueError when it cannot be one."""
     if values is None:
         return None
-    covariance = np.array(values, dtype=np.float64).reshape(6, 6)
+    covariance = np.array(values, dtype=np.float64).reshape(size, size)
     if not np.isfinite(covariance).all() or not np.allclose(covariance, covariance.T):
-        raise ValueError("a covariance is a finite, symmetric 6x6 matrix")
+        raise ValueError(f"a covariance is a finite, symmetric {size}x{size} matrix")
     return covariance

@@ -5,7 +5,9 @@ import time
 from pathlib import Path
 
 from rig_calib.calibration import CalibrationResult, calibrate
-from rig_calib.provenance import with_provenance
+from rig_calib.provenance import with_provenance, with_recalibration
+from rig_calib.recalibration import find_camera, recalibrate
+from rig_calib.rig_calibration import RigCalibration
 from rig_calib.settings import CalibrationSettings
 from rig_calib.stages import Progress
 from rig_calib.view import CameraView, views_from_panoramas
@@ -28,12 +30,43 @@ def solve_folder(
     views = read_views(folder, description, frames)
     load_s = time.perf_counter() - started_s
     result = calibrate(views, description.ring, settings, progress)
-    known = result.calibration
-    seconds = {**known.seconds, "load": load_s, "total": known.seconds["total"] + load_s}
     calibration = with_provenance(
-        dataclasses.replace(known, seconds=seconds), "folder", 0, settings.model_dump(mode="json")
+        _with_load(result.calibration, load_s), "folder", 0, settings.model_dump(mode="json")
     )
     return dataclasses.replace(result, calibration=calibration), views
+
+
+def recalibrate_folder(
+    folder: Path,
+    known: RigCalibration,
+    camera: str,
+    settings: CalibrationSettings,
+    frames: int | None = None,
+    progress: Progress | None = None,
+) -> tuple[CalibrationResult, list[CameraView]]:
+    """Find one camera (its name or id) of a known calibration anew on frames of a folder.
+
+    Errors as `solve_folder`; ConfigurationError for a camera that is not there, too.
+    """
+    started_s = time.perf_counter()
+    description = read_rig_description(folder)
+    camera_id = find_camera(camera, known, {entry.id: entry.name for entry in description.cameras})
+    views = read_views(folder, description, frames)
+    load_s = time.perf_counter() - started_s
+    result = recalibrate(views, known, camera_id, description.ring, settings, progress)
+    found = _with_load(result.calibration, load_s)
+    used = max(len(view.color) for view in views)
+    calibration = with_recalibration(
+        found, known, camera_id, used, source="folder", settings=settings.model_dump(mode="json")
+    )
+    return dataclasses.replace(result, calibration=calibration), views
+
+
+def _with_load(calibration: RigCalibration, load_s: float) -> RigCalibration:
+    seconds = calibration.seconds
+    return dataclasses.replace(
+        calibration, seconds={**seconds, "load": load_s, "total": seconds["total"] + load_s}
+    )
 
 
 def read_views(folder: Path, description: RigDescription, frames: int | None = None) -> list[CameraView]:

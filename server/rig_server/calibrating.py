@@ -5,78 +5,73 @@ from collections.abc import Mapping
 from pathlib import Path
 
 from rich.console import Console
-from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeElapsedColumn
 
 from rig_calib.evaluation import evaluate
-from rig_calib.outputs import write_outputs
+from rig_calib.outputs import keep_before, write_outputs
 from rig_calib.rig_calibration import RigCalibration
 from rig_calib.terminal import calibration_tables, evaluation_table, progress_bar
 from rig_protocol.errors import RigError
 from rig_protocol.poses import Pose
 from rig_protocol.rig_folder import write_true_poses
+from rig_server.calibration_task import CalibrationTask, Estimate
+from rig_server.coach_display import CoachDisplay, counted
+from rig_server.coached_capture import coached_capture
 from rig_server.rig import Rig
-from rig_server.sinks.calibrate import CalibrateSink, with_agents
-
-_POLL_S = 0.5
 
 
-def calibrate_rig(rig: Rig, folder: Path, console: Console) -> None:
+def calibrate_rig(rig: Rig, folder: Path, console: Console, task: CalibrationTask | None = None) -> None:
     """Wait for the cameras, collect, calibrate, write the files, print the tables.
 
-    RigError when cameras do not come, or when the result fails its gate (the files are written then, too).
+    RigError when cameras do not come, when the result fails its gate, and when it misses the task's target
+    (the files are written in the last two cases, too). The default task is the whole rig.
     """
+    task = task or CalibrationTask.whole_rig(rig.settings)
     started_s = time.monotonic()
-    with _progress(console) as progress, rig:
-        sink = _collect(rig, progress)
+    with CoachDisplay(console) as display, rig:
+        _wait_for_cameras(rig, display)
         truth = rig.true_poses()
-        description, hellos = rig.description, rig.hellos
-    collected_s = time.monotonic()
+        estimate = coached_capture(rig, task, display)
+    calibrated_s = time.monotonic()
+    calibration = task.stamped(estimate, rig.hellos, rig.source)
+    if task.known is not None:
+        keep_before(folder)
     with progress_bar(console) as tell:
-        result, views = sink.calibrate(description, rig.settings.calibration, tell)
-        calibration = with_agents(result.calibration, hellos, rig.settings, rig.source)
-        calibrated_s = time.monotonic()
-        write_outputs(folder, calibration, views, result.evidence, result.poses_before, tell)
-    console.print(calibration_tables(calibration, views))
+        result = estimate.result
+        write_outputs(folder, calibration, estimate.views, result.evidence, result.poses_before, tell)
+    console.print(calibration_tables(calibration, estimate.views))
     console.print(
-        f"wrote calibration.json, report.html, cloud.ply, panorama.png to {folder}; capture "
-        f"{collected_s - started_s:.1f} s, calibration {calibrated_s - collected_s:.1f} s, "
+        f"wrote calibration.json, report.html, cloud.ply, panorama.png to {folder}; "
+        f"capture and calibration {calibrated_s - started_s:.1f} s, "
         f"pictures {time.monotonic() - calibrated_s:.1f} s",
         soft_wrap=True,
     )
     if truth is not None and calibration.cameras:
         _compare(calibration, truth, folder, console)
-    if calibration.failures:
-        raise RigError("the calibration fails its gate: " + "; ".join(calibration.failures))
+    _judge(task, estimate, console)
 
 
-def _collect(rig: Rig, progress: Progress) -> CalibrateSink:
-    capture = rig.settings.capture
-    waiting = progress.add_task("waiting for cameras", total=rig.settings.expected_cameras)
-    rig.wait_for_cameras(capture.wait_s, lambda status: progress.update(waiting, completed=status.connected))
+def _wait_for_cameras(rig: Rig, display: CoachDisplay) -> None:
+    expected = rig.settings.expected_cameras or len(rig.settings.cameras) or None
+    rig.wait_for_cameras(
+        rig.settings.capture.wait_s, lambda status: display.connected(status.connected, expected)
+    )
     connected = rig.status().connected
-    progress.update(waiting, description="cameras connected", completed=connected, total=connected)
-    sink = CalibrateSink(capture.frames, rig.description.camera_ids)
-    collecting = progress.add_task("panoramic frames", total=capture.frames)
-    until_s = time.monotonic() + capture.wait_s
-    wanted = True
-    while wanted and not rig.ended and time.monotonic() < until_s:
-        panorama = rig.next_panorama(_POLL_S)
-        if panorama is not None:
-            wanted = sink.take(panorama)
-            progress.update(collecting, completed=sink.complete)
-    return sink
+    display.connected(connected, connected)
+
+
+def _judge(task: CalibrationTask, estimate: Estimate, console: Console) -> None:
+    """RigError when the gate or the target says no."""
+    troubles = []
+    if estimate.calibration.failures:
+        troubles.append("the calibration fails its gate: " + "; ".join(estimate.calibration.failures))
+    if estimate.missed is not None:
+        troubles.append(f"the calibration misses its target: {estimate.missed}")
+    if troubles:
+        raise RigError("; ".join(troubles))
+    if task.target is not None:
+        console.print(f"the target is met on {counted(estimate.sets, 'set')}")
 
 
 def _compare(calibration: RigCalibration, truth: Mapping[int, Pose], folder: Path, console: Console) -> None:
     write_true_poses(folder / "truth.json", truth)
     console.print(evaluation_table(evaluate(calibration, truth)))
-
-
-def _progress(console: Console) -> Progress:
-    return Progress(
-        TextColumn("{task.description}"),
-        BarColumn(),
-        MofNCompleteColumn(),
-        TimeElapsedColumn(),
-        console=console,
-    )

@@ -31,6 +31,10 @@ _EXAMPLES = """
 
 `rig-server --calibrate --simulate 12 --out demo` — the same with twelve simulated Kinects on this machine
 
+`rig-server --calibrate --coach --target-mm 3` — the same, until it is that good: hang patterns meanwhile
+
+`rig-server --calibrate --recalibrate cam04` — one camera was knocked: find it, keep all others
+
 `rig-server budget` — what the network must carry, what fits, and what the server would choose
 
 Every option can also stand in rig.toml or in the environment (RIG_SERVER_LISTEN, ...).
@@ -78,6 +82,27 @@ def run(
     method: Annotated[
         str | None, typer.Option(metavar="joint|paper", help="How to calibrate; else joint.")
     ] = None,
+    target_mm: Annotated[
+        float | None,
+        typer.Option(metavar="X", help="End once neighbours are expected to be known to X mm (RMS)."),
+    ] = None,
+    target_deg: Annotated[
+        float | None, typer.Option(metavar="X", help="The same for their rotation, in degrees.")
+    ] = None,
+    coach: Annotated[
+        bool,
+        typer.Option(
+            "--coach", help="Go on with fresh sets until every overlap holds: hang patterns meanwhile."
+        ),
+    ] = False,
+    recalibrate: Annotated[
+        str | None,
+        typer.Option(metavar="CAMERA", help="Find only this one (name or id) anew, keep all others."),
+    ] = None,
+    calibration: Annotated[
+        Path | None,
+        typer.Option(metavar="FILE", help="What --recalibrate starts from; else DIR/calibration.json."),
+    ] = None,
     out: Annotated[
         Path | None, typer.Option(metavar="DIR", help="Folder for the results; else ./calibration.")
     ] = None,
@@ -88,12 +113,27 @@ def run(
     """Receive the agents' frames and group them into panoramic frames.
 
     With `--calibrate`: wait for the cameras, calibrate, write calibration.json, report.html, cloud.ply and
-    panorama.png. Otherwise: show a live table until Ctrl-C.
+    panorama.png. Meanwhile a table shows how well every overlap is known so far and what to do where it lacks
+    support. A target that K sets do not reach ends with status 1 and says which pair limits; the files are
+    written. Otherwise: show a live table until Ctrl-C.
     """
     if context.invoked_subcommand is not None:
         return
     _refuse_options_without_effect(
-        calibrate, simulate, {"--frames": frames, "--method": method, "--out": out}, seed, listen
+        calibrate,
+        simulate,
+        {
+            "--frames": frames,
+            "--method": method,
+            "--target-mm": target_mm,
+            "--target-deg": target_deg,
+            "--coach": coach or None,
+            "--recalibrate": recalibrate,
+            "--calibration": calibration,
+            "--out": out,
+        },
+        seed,
+        listen,
     )
     from rig_server.config import load_rig_settings
 
@@ -101,7 +141,7 @@ def run(
         "listen": listen,
         "insecure": insecure or None,
         "metrics": metrics,
-        "capture": {"frames": frames},
+        "capture": {"frames": frames, "target_mm": target_mm, "target_deg": target_deg},
         "calibration": {"method": method},
     }
     settings = load_rig_settings(config, changes)
@@ -113,12 +153,19 @@ def run(
     set_up_logging(settings.log_level, console)
     # What takes a second to import comes after everything that can be refused at once.
     if calibrate:
-        from rig_calib.outputs import make_output_folder
+        from rig_calib.outputs import known_calibration, make_output_folder
         from rig_server.calibrating import calibrate_rig
+        from rig_server.calibration_task import CalibrationTask
 
-        make_output_folder(folder := out or Path("calibration"))
+        folder = out or Path("calibration")
+        known = known_calibration(recalibrate, calibration, folder)
+        make_output_folder(folder)
         with _open_rig(settings, simulate, seed) as rig:
-            calibrate_rig(rig, folder, console)
+            if recalibrate is None or known is None:
+                task = CalibrationTask.whole_rig(rig.settings, coach)
+            else:
+                task = CalibrationTask.one_camera(rig.settings, known, recalibrate, coach)
+            calibrate_rig(rig, folder, console, task)
     else:
         from rig_server.receiving import receive
 

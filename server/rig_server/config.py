@@ -104,6 +104,10 @@ class CaptureSettings(Settings):
 
     frames: int = Field(5, ge=1, le=100)
     """Panoramic frames to calibrate on."""
+    target_deg: float | None = Field(None, gt=0, le=180, examples=[0.1])
+    """End as soon as every pair of neighbours is expected to be known this well (root mean square)."""
+    target_mm: float | None = Field(None, gt=0, le=10_000, examples=[3.0])
+    """The same for their distance; with both, both must hold. What K frames do not reach is a failure."""
     wait_s: float = Field(60.0, gt=0, le=86_400)
     """How long to wait for the expected cameras, and then for complete sets."""
 

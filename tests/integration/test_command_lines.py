@@ -46,6 +46,8 @@ def test_a_camera_that_never_comes_is_named(tmp_path: Path) -> None:
         ("rig_server.cli", ["keygen", "--path", "absent/rig.key"], "absent/rig.key"),
         ("rig_agent.cli", ["--source", "folder", "--fps", -1], "fps"),
         ("rig_calib.cli", ["solve", "absent", "--out", "out"], "absent"),
+        ("rig_calib.cli", ["solve", ".", "--recalibrate", "cam01", "--out", "out"], "out/calibration.json"),
+        ("rig_calib.cli", ["solve", ".", "--calibration", "x.json", "--out", "out"], "--recalibrate"),
         ("rig_calib.cli", ["evaluate", "absent.json", "absent.json"], "absent.json"),
     ],
 )
@@ -74,6 +76,28 @@ def test_help_teaches_by_examples(module: str) -> None:
     done = run_program(module, "--help")
     assert done.returncode == 0
     assert "xample" in done.stdout
+
+
+def test_a_target_ends_a_capture_early_and_a_camera_is_found_anew_with_the_others_untouched(
+    tmp_path: Path,
+) -> None:
+    """Three simulated cameras over loopback; the second run's target is out of reach."""
+    options = ["--calibrate", "--simulate", 3, "--out", tmp_path]
+    done = run_program("rig_server.cli", *options, "--frames", 20, "--target-mm", 60, "--target-deg", 3)
+    assert done.returncode == 0, done.stdout + done.stderr
+    assert "the target is met on 1 set" in done.stdout
+    before = json.loads((tmp_path / "calibration.json").read_text())
+    assert before["frames_used"] == 1
+    again = [*options, "--frames", 1, "--recalibrate", "cam02", "--target-mm", 0.01]
+    done = run_program("rig_server.cli", *again)
+    assert done.returncode == 1, done.stdout + done.stderr
+    assert "misses its target: cam01–cam02 limits" in done.stderr
+    assert "Traceback" not in done.stderr
+    after = json.loads((tmp_path / "calibration.json").read_text())
+    assert after["cameras"][:2] == before["cameras"][:2]
+    assert after["cameras"][2] != before["cameras"][2]
+    assert [one["name"] for one in after["provenance"]["recalibrated"]] == ["cam02"]
+    assert json.loads((tmp_path / "calibration-before.json").read_text()) == before
 
 
 def test_simulated_rig_is_calibrated_fused_and_compared_with_the_truth(tmp_path: Path) -> None:

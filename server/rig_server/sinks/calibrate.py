@@ -1,19 +1,9 @@
-"""The calibrating sink: collects panoramic frames, then calibrates on them."""
+"""The calibrating sink: collects the panoramic frames to calibrate on."""
 
-import dataclasses
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 
-from rig_calib.calibration import CalibrationResult, calibrate
-from rig_calib.provenance import with_provenance
-from rig_calib.rig_calibration import RigCalibration
-from rig_calib.settings import CalibrationSettings
-from rig_calib.stages import Progress
-from rig_calib.view import CameraView, views_from_panoramas
 from rig_protocol.errors import RigError
 from rig_protocol.frames import PanoramicFrame
-from rig_protocol.messages import Hello
-from rig_protocol.rig_folder import RigDescription
-from rig_server.config import RigSettings
 
 
 class CalibrateSink:
@@ -42,6 +32,10 @@ class CalibrateSink:
         """How many complete sets there are."""
         return len(self._complete)
 
+    def first(self, count: int) -> list[PanoramicFrame]:
+        """The first `count` complete sets, or as many as there are."""
+        return self._complete[:count]
+
     def chosen(self) -> tuple[list[PanoramicFrame], tuple[str, ...]]:
         """The sets to calibrate on, and a warning where partial ones had to do; RigError for none at all."""
         if not (self._complete or self._partial):
@@ -52,18 +46,6 @@ class CalibrateSink:
         spare = self._partial[: self._count - len(self._complete)]
         chosen = sorted([*self._complete, *spare], key=lambda panorama: panorama.index)
         return chosen, self._warnings(len(chosen), spare)
-
-    def calibrate(
-        self, description: RigDescription, settings: CalibrationSettings, progress: Progress
-    ) -> tuple[CalibrationResult, list[CameraView]]:
-        """Calibrate on the chosen sets; this sink's warnings come before the calibration's own."""
-        panoramas, warnings = self.chosen()
-        views = views_from_panoramas(description, panoramas)
-        result = calibrate(views, description.ring, settings, progress)
-        calibration = dataclasses.replace(
-            result.calibration, warnings=(*warnings, *result.calibration.warnings)
-        )
-        return dataclasses.replace(result, calibration=calibration), views
 
     def _lacking(self, panorama: PanoramicFrame) -> list[int]:
         """Cameras of which the set holds no frame, or a damaged one."""
@@ -79,20 +61,3 @@ class CalibrateSink:
             f"missing or damaged at times: cameras {', '.join(map(str, lacking))}"
         )
         return (warning,)
-
-
-def with_agents(
-    calibration: RigCalibration, hellos: Mapping[int, Hello], settings: RigSettings, source: str
-) -> RigCalibration:
-    """The same calibration with what the agents told, its source and the settings of the server."""
-    cameras = tuple(
-        dataclasses.replace(camera, serial=hellos[camera.id].serial) if camera.id in hellos else camera
-        for camera in calibration.cameras
-    )
-    return with_provenance(
-        dataclasses.replace(calibration, cameras=cameras),
-        source,
-        len(hellos),
-        settings.model_dump(mode="json"),
-        agent_software=sorted({hello.software for hello in hellos.values()}),
-    )

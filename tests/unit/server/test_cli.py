@@ -92,6 +92,13 @@ def test_help_teaches_with_examples(rig_server: Program, capsys: pytest.CaptureF
     ("words", "told"),
     [
         (["--frames", "3"], "--frames needs --calibrate"),
+        (["--target-mm", "3"], "--target-mm needs --calibrate"),
+        (["--coach"], "--coach needs --calibrate"),
+        (["--recalibrate", "cam03"], "--recalibrate needs --calibrate"),
+        (["--calibrate", "--insecure", "--calibration", "x.json"], "--calibration needs --recalibrate"),
+        (["--calibrate", "--insecure", "--recalibrate", "cam03"], "there is no calibration/calibration.json"),
+        (["--calibrate", "--insecure", "--target-mm", "0"], "capture.target_mm"),
+        (["--calibrate", "--simulate", "2", "--method", "paper", "--target-deg", "1"], "paper"),
         (["--seed", "3"], "--seed needs --simulate"),
         (["--simulate", "2", "--listen", ":0"], "--listen has no effect with --simulate"),
         (["--calibrate", "--method", "magic"], "calibration.method"),

@@ -1,0 +1,103 @@
+"""Panoramic frames collected while a background thread calibrates on those that are in."""
+
+import time
+from collections import deque
+from functools import partial
+
+from rig_protocol.frames import PanoramicFrame
+from rig_server.background_work import BackgroundWork
+from rig_server.calibration_task import CalibrationTask, Estimate
+from rig_server.coach_display import CoachDisplay
+from rig_server.rig import Rig
+from rig_server.sinks.calibrate import CalibrateSink
+
+_POLL_S = 0.25
+
+
+def coached_capture(rig: Rig, task: CalibrationTask, display: CoachDisplay) -> Estimate:
+    """Collect sets and calibrate on them; a coached task goes on with fresh sets until it is content.
+
+    Closes the rig as soon as it needs no more sets. RigError when no frame comes, or when the calibration's
+    input is unusable.
+    """
+    with BackgroundWork[Estimate]("calibration") as work:
+        while True:
+            estimate = _Round(rig, task, display, work).run()
+            if not task.coached or task.contents(estimate):
+                return estimate
+            _skip_waiting_sets(rig)
+            if rig.ended:  # nobody can hang a pattern into a recording
+                return estimate
+
+
+class _Round:
+    """K complete sets, with an estimate on the first 1, 2, 4, ... of them, and one on all at the end.
+
+    With a target every estimate counts: the first that meets it ends the round, whenever its sets came, so
+    that a recording gives the same result as the capture did. Without one, they are for the coach only, and
+    what is out of date is left out.
+    """
+
+    def __init__(
+        self, rig: Rig, task: CalibrationTask, display: CoachDisplay, work: BackgroundWork[Estimate]
+    ) -> None:
+        capture = task.settings.capture
+        self._rig, self._task, self._display, self._work = rig, task, display, work
+        self._sink = CalibrateSink(capture.frames, rig.description.camera_ids)
+        self._due = deque(doublings(capture.frames))
+        self._until_s = time.monotonic() + capture.wait_s
+        self._wanted = True
+        self._final = False
+
+    def run(self) -> Estimate:
+        """The first estimate that is the last of the round or contents the task's target."""
+        while True:
+            if self._wanted:
+                self._collect()
+            estimate = self._work.take(0.0 if self._wanted else _POLL_S)
+            if estimate is not None:
+                last = self._final or (self._task.target is not None and self._task.contents(estimate))
+                self._display.show(estimate, last)
+                if last:
+                    return estimate
+            self._go_on()
+
+    def _collect(self) -> None:
+        panorama = self._rig.next_panorama(_POLL_S)
+        more = True if panorama is None else self._sink.take(panorama)
+        self._wanted = more and not self._rig.ended and time.monotonic() < self._until_s
+        if not (self._wanted or self._task.coached):
+            self._rig.close()  # decoding, and simulated agents, would only slow down what follows
+        self._display.collected(self._sink.complete, self._task.settings.capture.frames)
+
+    def _go_on(self) -> None:
+        """Begin the next estimate when it is due and the one before has ended."""
+        for_coach_only = self._task.target is None
+        if self._work.busy:
+            if for_coach_only and not self._wanted and not self._final:
+                self._work.give_up()
+            return
+        if for_coach_only:
+            while len(self._due) > 1 and self._due[1] <= self._sink.complete:
+                self._due.popleft()
+        if self._due and self._due[0] <= self._sink.complete and not (for_coach_only and not self._wanted):
+            self._start(self._sink.first(self._due.popleft()), ())
+        elif not self._wanted:
+            self._final = True
+            self._start(*self._sink.chosen())
+
+    def _start(self, panoramas: list[PanoramicFrame], warnings: tuple[str, ...]) -> None:
+        self._display.begun(len(panoramas))
+        work = partial(self._task.estimate, self._rig.description, panoramas, warnings)
+        self._work.start(work, self._display.tell)
+
+
+def doublings(count: int) -> list[int]:
+    """1, 2, 4, ... below `count`."""
+    return [1 << k for k in range(count.bit_length()) if 1 << k < count]
+
+
+def _skip_waiting_sets(rig: Rig) -> None:
+    """Sets that came before now show the room as it was."""
+    while not rig.ended and rig.next_panorama(0.0) is not None:
+        continue
