@@ -157,8 +157,8 @@ def pose_graph(
     """Optimise a pose graph and say whether its optimum is the global one.
 
     Minimised is SE-Sync's chordal objective, sum κ |R_j − R_i R_ij|² + τ |t_j − t_i − R_i t_ij|² with
-    κ = 3 / (2 tr Λ_R⁻¹), τ = 3 / tr Λ_t⁻¹: plain least squares whose optimum can be certified. Where an
-    edge's information differs much by direction (one axis ten times another, or strong correlation), minimised is
+    κ = 3 / (2 tr Λ_R⁻¹), τ = 3 / tr Λ_t⁻¹: plain least squares whose optimum can be certified. Where the
+    information of an edge differs much by direction (one axis ten times another, strong correlation), it is
     ½ sum r' Λ r, r = Log(T_ij⁻¹ T_i⁻¹ T_j), with the full 6×6 information, from the chordal optimum on.
     """
     from rich.console import Console

@@ -31,6 +31,7 @@ _SWAPPED = np.array([3, 4, 5, 0, 1, 2])
 _QUATERNION_NORM_TOLERANCE = 0.01  # files hold six digits
 _LARGEST = 1e12  # of any number: a metre, an information
 _LARGEST_ID = 2**62
+_INDEPENDENT = 1e-9  # least eigenvalue of an information that is scaled to a unit diagonal
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -186,8 +187,9 @@ def _information(numbers: Array, lines: list[int]) -> Array:
     """Information (M,6,6), rotation first, of the upper triangles (M,21) of translation-first ones."""
     full = np.zeros((len(numbers), 6, 6))
     full[:, _UPPER[0], _UPPER[1]] = full[:, _UPPER[1], _UPPER[0]] = numbers
-    axes = np.linalg.eigvalsh(full)
-    for wrong in np.flatnonzero(axes[:, 0] <= 1e-12 * axes[:, -1]):
+    scale = np.sqrt(np.maximum(np.einsum("nii->ni", full), 0.0))
+    correlation = full / np.maximum(scale[:, :, None] * scale[:, None, :], np.finfo(float).tiny)
+    for wrong in np.flatnonzero(np.linalg.eigvalsh(correlation)[:, 0] < _INDEPENDENT):
         raise DataError(f"line {lines[wrong]}: the information matrix is not positive definite")
     return full[:, _SWAPPED][:, :, _SWAPPED]
 
