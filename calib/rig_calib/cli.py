@@ -166,7 +166,7 @@ def pose_graph(
     from rig_calib.pose_graph.g2o import read_g2o, write_g2o
     from rig_calib.pose_graph.solution import solve as solve_graph
     from rig_calib.terminal import pose_graph_report, progress_bar
-    from rig_protocol.errors import ConfigurationError, RigError
+    from rig_protocol.errors import ConfigurationError
 
     if out.is_dir() or not out.parent.is_dir():
         raise ConfigurationError(f"{out} cannot be written: --out names a file in a folder that exists")
@@ -177,11 +177,6 @@ def pose_graph(
     console.print(pose_graph_report(solution))
     if as_json:
         _print_json(solution.to_dict())
-    if solution.loose:
-        raise RigError(
-            f"without the rejected edges nothing ties {len(solution.loose)} poses to the others, "
-            f"the first is {solution.loose[0]}: measure them again, or solve without --robust"
-        )
 
 
 def main() -> None:

@@ -3,6 +3,7 @@
 Any graph will do: a ring with its loop closure, all pairs of a rig, a map of thousands of poses.
 """
 
+from rig_calib.pose_graph.edge_batch import squared_distances
 from rig_calib.pose_graph.graph import (
     PoseEdge,
     chain_poses,
@@ -22,4 +23,5 @@ __all__ = [
     "loop_error",
     "optimise",
     "spanning_tree",
+    "squared_distances",
 ]

@@ -27,7 +27,7 @@ from rig_calib.pose_graph.se3_batches import (
     logarithms,
     quaternions,
 )
-from rig_protocol.poses import hat
+from rig_protocol.poses import Pose, hat
 
 Array = npt.NDArray[np.float64]
 Index = npt.NDArray[np.intp]
@@ -135,6 +135,13 @@ class LinearisedEdges:
     ij: Array
     i: Array
     j: Array
+
+
+def squared_distances(edges: Sequence[PoseEdge], poses: Mapping[int, Pose]) -> Array:
+    """rᵀ Λ r (M,) of every edge under given poses: χ² of six degrees of freedom where the edge is right."""
+    row = {node: k for k, node in enumerate(poses)}
+    T = np.array(list(poses.values()), dtype=np.float64).reshape(-1, 4, 4)
+    return EdgeBatch.of(edges, row).squared_distances(T, "geodesic")
 
 
 def _chordal(E: Array) -> Array:

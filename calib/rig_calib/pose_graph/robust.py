@@ -15,6 +15,7 @@ from rig_calib.pose_graph.start import chordal_start
 from rig_calib.stages import Progress
 
 Array = npt.NDArray[np.float64]
+Index = npt.NDArray[np.intp]
 Mask = npt.NDArray[np.bool_]
 
 # 99.9999 % of a six-dimensional residual: an edge beyond is wrong, not unlucky.
@@ -36,20 +37,19 @@ def reject_wrong_edges(
 
     Of T only the fixed poses count. One start believes the edges of short cycles that close; where all
     consecutive nodes are joined, another trusts this odometry while the weights harden. The better result
-    is taken, and its verdict trusts nothing.
+    is taken, and its verdict trusts nothing. What is kept ties every pose to a fixed one.
     """
     plain, _, _ = minimise(chordal_start(T, edges, pattern), edges, pattern, objective)
     distance = edges.squared_distances(plain, objective)
     if (distance <= WRONG).all():
         return plain, np.ones(len(edges), dtype=bool)
-    found: list[Array] = []
+    found: list[tuple[Array, Mask]] = []
     for believed, trusted in _starts(edges, len(T)):
         tell("wrong edges", 0.4 * len(found))
         start = chordal_start(T, edges.weighted(np.where(believed, 1.0, _DOUBTFUL_WEIGHT)), pattern)
         hardened = _harden(start, edges, pattern, objective, trusted)
         found.append(_reclassified(hardened, edges, pattern, objective))
-    best = min(found, key=lambda poses: _truncated(edges.squared_distances(poses, objective)))
-    return best, edges.squared_distances(best, objective) <= WRONG
+    return min(found, key=lambda one: _truncated(edges.squared_distances(one[0], objective)))
 
 
 def _starts(edges: EdgeBatch, count: int) -> list[tuple[Mask, Mask]]:
@@ -83,15 +83,32 @@ def _weights(distance: Array, mu: float) -> Array:
     )
 
 
-def _reclassified(T: Array, edges: EdgeBatch, pattern: BlockPattern, objective: Objective) -> Array:
-    """Least squares over what agrees, until the same edges agree with the result."""
-    kept = edges.squared_distances(T, objective) <= WRONG
+def _reclassified(
+    T: Array, edges: EdgeBatch, pattern: BlockPattern, objective: Objective
+) -> tuple[Array, Mask]:
+    """Least squares over what agrees, until the same edges agree with the result; poses and these edges."""
+    kept = _tied(edges, edges.squared_distances(T, objective), pattern.order, len(T))
     for _ in range(_RECLASSIFICATIONS):
         T, _, _ = minimise(T, edges.weighted(kept.astype(np.float64)), pattern, objective)
-        before, kept = kept, edges.squared_distances(T, objective) <= WRONG
+        before, kept = kept, _tied(edges, edges.squared_distances(T, objective), pattern.order, len(T))
         if (kept == before).all():
             break
-    return T
+    return T, kept
+
+
+def _tied(edges: EdgeBatch, distance: Array, free: Index, count: int) -> Mask:
+    """The edges (M,) that agree, and of the others the nearest that tie every pose to a fixed one.
+
+    Nothing contradicts those: a part of the graph that hangs on one edge can always follow it.
+    """
+    kept = distance <= WRONG
+    while True:
+        parts = edges.select(kept).parts(count)
+        parts[np.isin(parts, np.delete(parts, free))] = -1
+        across = np.flatnonzero(parts[edges.i] != parts[edges.j])
+        if not len(across):
+            return kept
+        kept[across[np.argmin(distance[across])]] = True
 
 
 def _truncated(distance: Array) -> float:

@@ -33,7 +33,7 @@ class Solution:
     """The graph with its optimal poses; which edges (M,) were kept, and both objectives of those.
 
     `before` holds the objectives of all edges at the given poses. `certificate` is the chordal optimum's,
-    from which a geodesic one starts. `loose` are ids of poses that no kept edge ties to a fixed one.
+    from which a geodesic one starts.
     """
 
     graph: PoseGraph
@@ -42,7 +42,6 @@ class Solution:
     before: dict[Objective, float]
     after: dict[Objective, float]
     certificate: Certificate
-    loose: tuple[int, ...]
     seconds: float
 
     @property
@@ -73,7 +72,6 @@ class Solution:
                 {"i": i, "j": j, "edge": int(k)}
                 for (i, j), k in zip(self.rejected, np.flatnonzero(~self.kept), strict=True)
             ],
-            "loose": list(self.loose),
             "seconds": self.seconds,
         }
 
@@ -94,18 +92,17 @@ def solve(
     count, edges = len(graph.ids), graph.edges
     if objective is None:
         objective = "chordal" if edges.nearly_isotropic() else "geodesic"
-    held = _fixed_in_every_part(graph.fixed, edges.parts(count))
+    free = ~_fixed_in_every_part(graph.fixed, edges.parts(count))
+    pattern = BlockPattern(edges.i, edges.j, free)
     kept = np.ones(len(edges), dtype=bool)
     tell("start", 0.0)
     if robust:
         weighed = edges.isotropic() if objective == "chordal" else edges
-        pattern = BlockPattern(edges.i, edges.j, ~held)
         start, kept = reject_wrong_edges(graph.T, weighed, pattern, objective, tell)
+        pattern = BlockPattern(edges.i[kept], edges.j[kept], free)
+    else:
+        start = chordal_start(graph.T, edges, pattern)
     used = edges.select(kept)
-    parts = used.parts(count)
-    pattern = BlockPattern(used.i, used.j, ~_fixed_in_every_part(held, parts))
-    if not robust:
-        start = chordal_start(graph.T, used, pattern)
     T, certificate = _chordal_optimum(graph.T, start, used.isotropic(), pattern, tell)
     if objective == "geodesic":
         tell("full information", 0.95)
@@ -114,27 +111,39 @@ def solve(
         graph.with_poses(T),
         kept,
         objective,
-        _objectives(graph.T, graph.edges),
-        _objectives(T, used),
+        objectives(graph.T, graph.edges),
+        objectives(T, used),
         certificate,
-        tuple(graph.ids[k] for k in np.flatnonzero(~np.isin(parts, parts[held]))),
         time.perf_counter() - started_s,
     )
+
+
+def objectives(T: Array, edges: EdgeBatch) -> dict[Objective, float]:
+    """Both objectives of poses T (N,4,4), each as its definition in `OBJECTIVES` says."""
+    return {
+        "chordal": float(edges.isotropic().squared_distances(T, "chordal").sum()),
+        "geodesic": 0.5 * float(edges.squared_distances(T, "geodesic").sum()),
+    }
 
 
 def _chordal_optimum(
     given: Array, start: Array, edges: EdgeBatch, pattern: BlockPattern, tell: Progress
 ) -> tuple[Array, Certificate]:
-    """The chordal optimum from a start; where it is not certified, also from the given poses."""
+    """The chordal optimum from a start; where that is not certified, also from the given poses.
+
+    Unless the graph is too large for a certificate and the given poses are no better to begin with.
+    """
     tell("optimum", 0.0)
     T, cost, _ = minimise(start, edges, pattern, "chordal")
     tell("certificate", 0.8)
     certificate = certify(T, edges)
-    if not certificate.certified:
-        tell("second start", 0.9)
-        other, other_cost, _ = minimise(given, edges, pattern, "chordal")
-        if other_cost < cost * (1.0 - _LOWER):
-            return other, certify(other, edges)
+    given_cost = 0.5 * float(edges.squared_distances(given, "chordal").sum())
+    if certificate.certified or (certificate.gap is None and given_cost >= cost):
+        return T, certificate
+    tell("second start", 0.9)
+    other, other_cost, _ = minimise(given, edges, pattern, "chordal")
+    if other_cost < cost * (1.0 - _LOWER):
+        return other, certify(other, edges)
     return T, certificate
 
 
@@ -145,10 +154,3 @@ def _fixed_in_every_part(fixed: Mask, parts: Index) -> Mask:
     out = fixed.copy()
     out[first[~holds[first]]] = True
     return out
-
-
-def _objectives(T: Array, edges: EdgeBatch) -> dict[Objective, float]:
-    return {
-        "chordal": float(edges.isotropic().squared_distances(T, "chordal").sum()),
-        "geodesic": 0.5 * float(edges.squared_distances(T, "geodesic").sum()),
-    }
