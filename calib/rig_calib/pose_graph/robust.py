@@ -23,6 +23,7 @@ WRONG = 38.3
 _HARDENING = 1.4
 _MAX_ROUNDS, _STEPS_A_ROUND = 150, 2
 _RECLASSIFICATIONS = 10
+_ENOUGH_IF_NONE_IS_WRONG = 15  # iterations of plain least squares; with wrong edges it would take many
 _DOUBTFUL_WEIGHT = 1e-6
 
 
@@ -39,7 +40,8 @@ def reject_wrong_edges(
     consecutive nodes are joined, another trusts this odometry while the weights harden. The better result
     is taken, and its verdict trusts nothing. What is kept ties every pose to a fixed one.
     """
-    plain, _, _ = minimise(chordal_start(T, edges, pattern), edges, pattern, objective)
+    start = chordal_start(T, edges, pattern)
+    plain, _, _ = minimise(start, edges, pattern, objective, _ENOUGH_IF_NONE_IS_WRONG)
     distance = edges.squared_distances(plain, objective)
     if (distance <= WRONG).all():
         return plain, np.ones(len(edges), dtype=bool)
