@@ -22,6 +22,8 @@ _EXAMPLES = """
 
 `rig-calib fuse captures/hall --calibration results/calibration.json --out hall` — fuse another capture
 
+`rig-calib pose-graph map.g2o --out solved.g2o --robust` — optimise any graph of 3D poses
+
 `rig-calib intrinsics board/*.png --board 9x6 --square-mm 25 --out unit.json` — measure one colour camera
 
 `rig-calib pattern --out patterns` — sheets to print and to hang where neighbours' views overlap
@@ -162,6 +164,40 @@ def intrinsics(
         f"fx {color.fx:.2f} fy {color.fy:.2f} cx {color.cx:.2f} cy {color.cy:.2f} px, "
         f"rms {estimate.color.rms_px:.3f} px, written to {out}"
     )
+
+
+@app.command("pose-graph")
+def pose_graph(
+    graph: Annotated[Path, typer.Argument(help="A .g2o file: VERTEX_SE3:QUAT, EDGE_SE3:QUAT, FIX.")],
+    out: Annotated[Path, typer.Option(help="The .g2o file to write.")],
+    robust: Annotated[
+        bool, typer.Option("--robust", help="Find wrong edges, leave them out and name them.")
+    ] = False,
+    as_json: AsJson = False,
+) -> None:
+    """Optimise a pose graph and say whether its optimum is the global one.
+
+    Minimised is SE-Sync's chordal objective, sum κ |R_j − R_i R_ij|² + τ |t_j − t_i − R_i t_ij|² with
+    κ = 3 / (2 tr Λ_R⁻¹), τ = 3 / tr Λ_t⁻¹: plain least squares whose optimum can be certified. Where the
+    information of an edge differs much by direction (one axis ten times another, strong correlation), it is
+    ½ sum r' Λ r, r = Log(T_ij⁻¹ T_i⁻¹ T_j), with the full 6×6 information, from the chordal optimum on.
+    """
+    from rich.console import Console
+
+    from rig_calib.pose_graph.g2o import read_g2o, write_g2o
+    from rig_calib.pose_graph.solution import solve as solve_graph
+    from rig_calib.terminal import pose_graph_report, progress_bar
+    from rig_protocol.errors import ConfigurationError
+
+    if out.is_dir() or not out.parent.is_dir():
+        raise ConfigurationError(f"{out} cannot be written: --out names a file in a folder that exists")
+    console = Console(quiet=as_json, highlight=False)
+    with progress_bar(console) as tell:
+        solution = solve_graph(read_g2o(graph), robust, tell=tell)
+        write_g2o(out, solution.graph)
+    console.print(pose_graph_report(solution))
+    if as_json:
+        _print_json(solution.to_dict())
 
 
 @app.command()

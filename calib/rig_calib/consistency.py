@@ -19,6 +19,7 @@ from rig_calib.pose_graph import (
     edge_residual,
     optimise,
     spanning_tree,
+    squared_distances,
 )
 from rig_protocol.poses import Pose, inverse, se3_log
 
@@ -156,12 +157,13 @@ def _score(edges: Sequence[PoseEdge], drawn: Sequence[PoseEdge], poses: Mapping[
 
 def _disagreement(edges: Sequence[PoseEdge], poses: Mapping[int, Pose]) -> float:
     """How many edges disagree, each counted up to one."""
-    return sum(min(_squared_distance(edge, poses) / _AGREEMENT, 1.0) for edge in edges)
+    return float(np.minimum(squared_distances(edges, poses) / _AGREEMENT, 1.0).sum()) if edges else 0.0
 
 
-def _squared_distance(edge: PoseEdge, poses: Mapping[int, Pose]) -> float:
-    r = edge_residual(edge, poses)
-    return float(r @ edge.information @ r)
+def _distances(
+    edges: Mapping[tuple[int, int], PoseEdge], poses: Mapping[int, Pose]
+) -> dict[tuple[int, int], float]:
+    return dict(zip(edges, squared_distances(list(edges.values()), poses).tolist(), strict=True))
 
 
 def _drop_contradictions(
@@ -174,22 +176,20 @@ def _drop_contradictions(
 
     What the drawing confirmed is imprecise, not false, and stays: a long loop adds up many small errors.
     """
-    kept = {
-        pair: edge
-        for pair, edge in edges.items()
-        if pair in confirmed or _squared_distance(edge, poses) <= _CONTRADICTION
-    }
+    start = _distances(edges, poses)
+    kept = {p: edge for p, edge in edges.items() if p in confirmed or start[p] <= _CONTRADICTION}
     while True:
         poses = optimise(poses, list(kept.values()), [root]).poses
         distances = {
-            pair: _squared_distance(edge, poses) for pair, edge in kept.items() if pair not in confirmed
+            pair: distance for pair, distance in _distances(kept, poses).items() if pair not in confirmed
         }
         worst = max(distances, key=lambda pair: distances[pair], default=None)
         if worst is None or distances[worst] <= _CONTRADICTION:
             break
         del kept[worst]
     # An edge that only the rough start refused may agree with the optimised poses.
-    kept |= {pair: edge for pair, edge in edges.items() if _squared_distance(edge, poses) <= _AGREEMENT}
+    found = _distances(edges, poses)
+    kept |= {pair: edge for pair, edge in edges.items() if found[pair] <= _AGREEMENT}
     poses = optimise(poses, list(kept.values()), [root]).poses
     return poses, {pair: _contradiction(edge, poses) for pair, edge in edges.items() if pair not in kept}
 

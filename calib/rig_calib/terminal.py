@@ -13,6 +13,7 @@ from rich.text import Text
 from rig_calib.evaluation import Evaluation
 from rig_calib.figures.tables import camera_rows, edge_rows, key_figures, verdict
 from rig_calib.fusion.viewpoint import rig_viewpoint
+from rig_calib.pose_graph.solution import Solution
 from rig_calib.rig_calibration import RigCalibration
 from rig_calib.stages import Progress
 from rig_calib.view import CameraView
@@ -93,6 +94,28 @@ def _consistency(evaluation: Evaluation) -> list[RenderableType]:
         for name, known in evaluation.consistency().items()
     ]
     return [Text(f"consistency: mean NEES per dof {', '.join(told)}")] if told else []
+
+
+def pose_graph_report(solution: Solution) -> RenderableType:
+    """What became of a pose graph: size, objective, certificate, seconds; the edges that were rejected."""
+    before, after = (values[solution.objective] for values in (solution.before, solution.after))
+    size = f"{len(solution.graph.ids):,} poses, {len(solution.kept):,} edges"
+    costs = f"{solution.objective} objective {before:.6g} before, {after:.6g} after"
+    lines = [f"{size}: {costs}, {_certificate(solution)}, {solution.seconds:.2f} s"]
+    if solution.rejected:
+        named = ", ".join(f"{i}–{j}" for i, j in solution.rejected)
+        lines.append(f"{len(solution.rejected)} wrong edges left out: {named}")
+    return Text("\n".join(lines))
+
+
+def _certificate(solution: Solution) -> str:
+    certificate = solution.certificate
+    subject = "" if solution.objective == "chordal" else "its start, the chordal optimum, is "
+    if certificate.gap is None:
+        return f"{subject}not checked (too large)"
+    if certificate.certified:
+        return f"{subject}certified global"
+    return f"{subject}not certified: gap {certificate.gap:.1%} to the bound {certificate.lower_bound:.6g}"
 
 
 def _edges(rows: Sequence[Mapping[str, str]]) -> list[RenderableType]:
