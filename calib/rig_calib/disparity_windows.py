@@ -38,7 +38,7 @@ def window_medians(disparity: Array, at: Array) -> Array:
 def _plane(
     disparity: Array, rows: tuple[int, int], columns: tuple[int, int], u0: float, v0: float, needed: float
 ) -> tuple[float, float, float]:
-    """Least-squares (a, b, c) of d = a + b (u − u0) + c (v − v0) over a window; NaN if too little is known."""
+    """Least-squares (a, b, c) of d = a + b (u − u0) + c (v − v0) over a window; NaN if little is known."""
     n, x_sum, y_sum, d_sum, base = 0, 0.0, 0.0, 0.0, np.nan
     xx, xy, yy, xd, yd = 0.0, 0.0, 0.0, 0.0, 0.0
     for v in range(rows[0], rows[1]):
