@@ -56,7 +56,7 @@ class ModelSigma:
 
 # Units differ from the common default by a percent, several pixels, and their lens's distortion.
 _MEASURED = ModelSigma(0.001, 0.6, 0.001, 0.04, 0.0005, 0.001, 0.6)
-_MODEL_SIGMA: Mapping[ModelSource, ModelSigma] = {
+MODEL_SIGMA: Mapping[ModelSource, ModelSigma] = {
     "factory": _MEASURED,
     "file": _MEASURED,
     "default": ModelSigma(0.01, 5.0, 0.1, 0.5, 0.003, 0.01, 5.0),
@@ -132,7 +132,7 @@ def _adjusted_camera(
     camera: ObservedCamera, start: Pose, ring: RingDrawing | None, fixed: bool, settings: CalibrationSettings
 ) -> AdjustedCamera:
     model, own_grid = camera.view.model, camera.view.depth_frame == "depth"
-    sigma = _MODEL_SIGMA[model.source]
+    sigma = MODEL_SIGMA[model.source]
     pose_sigma = None
     if ring is not None:
         pose_sigma = np.repeat([np.deg2rad(ring.tolerance_deg), ring.tolerance_m], 3)

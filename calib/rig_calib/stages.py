@@ -5,6 +5,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
 from numba.core.event import Event, Listener, install_listener
+from threadpoolctl import ThreadpoolController
 
 Progress = Callable[[str, float], None]
 """Told the stage and the share of the whole that is done, 0 to 1."""
@@ -21,17 +22,22 @@ class Stages:
     def __init__(self, progress: Progress | None) -> None:
         self._progress = progress
         self._seconds = {"load": 0.0} | dict.fromkeys(_SHARES, 0.0)
+        self._libraries = ThreadpoolController()
         self._current = ""
         self._share = 0.0
         self._done = 0.0
 
     @contextmanager
     def stage(self, name: str) -> Iterator[None]:
-        """Time one stage."""
+        """Time one stage, whose linear algebra has one thread.
+
+        Its matrices are small: threads would wait for each other, with the cores in their hands.
+        """
         self._current, self._share = name, 0.0
         self.tell(0.0)
         started_s = time.perf_counter()
-        with install_listener("numba:compile", _CompilationListener(self)):
+        listener = _CompilationListener(self)
+        with install_listener("numba:compile", listener), self._libraries.limit(limits=1, user_api="blas"):
             yield
         self._seconds[name] += time.perf_counter() - started_s
         self.tell(1.0)
