@@ -4,7 +4,9 @@ Keypoints on the overlaps, matches, 3D points, relative poses of pairs (sections
 closed over the loop (II-B). The method `joint` puts one adjustment of everything in place of the last.
 """
 
+import os
 from collections.abc import Iterable, Mapping, Sequence, Set
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -150,13 +152,15 @@ def _observe_all(
     for pair, sides in regions.items():
         for camera_id, region in zip(pair, sides, strict=True):
             wanted[camera_id] = region.union(wanted.get(camera_id, region))
+    sharing = [view for view in views if view.camera_id in wanted]
     cameras = {}
-    for k, view in enumerate(views):
-        if view.camera_id in wanted:
-            cameras[view.camera_id] = observe(
-                view, wanted[view.camera_id], settings.max_keypoints, settings.pixel_sigma
-            )
-        stages.tell((k + 1) / len(views))
+    with ThreadPoolExecutor(os.cpu_count()) as pool:  # detectors run without the interpreter's lock
+        observed = pool.map(
+            lambda v: observe(v, wanted[v.camera_id], settings.max_keypoints, settings.pixel_sigma), sharing
+        )
+        for view, camera in zip(sharing, observed, strict=True):
+            cameras[view.camera_id] = camera
+            stages.tell(len(cameras) / len(sharing))
     return cameras
 
 

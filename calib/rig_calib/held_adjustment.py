@@ -12,7 +12,7 @@ from rig_calib.bundle_adjustment import AdjustedCamera, Adjustment, adjust
 from rig_calib.depth_model import DepthCorrection, DepthGrid, depth_grid
 from rig_calib.observation_model import POSE, CameraState, Observations
 from rig_calib.projection import from_pixels
-from rig_calib.rig_adjustment import INTRINSICS_SIGMA, AdjustedRig, bias_sigma
+from rig_calib.rig_adjustment import AdjustedRig, bias_sigma, model_sigmas
 from rig_calib.rig_calibration import RigCalibration
 from rig_calib.settings import CalibrationSettings
 from rig_calib.view import CameraView
@@ -85,9 +85,9 @@ def _adjusted_camera(
     return AdjustedCamera(
         color=view.model.color,
         grid=grid,
-        start=CameraState(start, np.zeros(settings.bias_terms), np.zeros(3)),
+        start=CameraState(start, np.zeros(settings.bias_terms)),
         bias_sigma=bias_sigma(grid, settings) * (1.0 if correction is None else _BIAS_LEFT),
-        intrinsics_sigma=np.array(INTRINSICS_SIGMA[view.model.source]),
+        **model_sigmas(view),
         T_prior=start if held else None,
         pose_sigma=_HELD_SIGMA if held else None,
     )

@@ -79,16 +79,28 @@ class Observations:
         """The observations that a mask or an index names."""
         return Observations(*(getattr(self, name)[keep] for name in self.__dataclass_fields__))
 
+    @property
+    def pixel_sigma(self) -> Array:
+        """Standard deviations (M,) of pixels in directions in which they are known; infinite if in none."""
+        information, full = self._pixel_information()
+        directions, unknown = np.where(full, 2.0, 1.0), np.full(len(self), np.inf)
+        variance = np.divide(directions, information, out=unknown, where=information > 0.0)
+        return np.asarray(np.sqrt(variance))
+
     def pixel_error(self, residuals: Array) -> Array:
         """Pixels (M,2) that whitened residuals (M,2) stand for; zero across what was not measured."""
         W = self.pixel_whitener
-        size = np.einsum("mij,mij->m", W, W)
-        determinant = W[:, 0, 0] * W[:, 1, 1] - W[:, 0, 1] * W[:, 1, 0]
-        full = np.abs(determinant) > 1e-6 * size
+        information, full = self._pixel_information()
         adjugate = W[:, (0, 1), (0, 1)].sum(axis=1)[:, None, None] * np.eye(2) - W
         pseudo_inverse = np.where(full[:, None, None], adjugate, W.transpose(0, 2, 1))
-        by = np.where(full, determinant, np.where(size > 0.0, size, 1.0))
+        by = np.where(full, _determinant(W), np.where(information > 0.0, information, 1.0))
         return np.asarray(np.einsum("mij,mj->mi", pseudo_inverse, residuals) / by[:, None])
+
+    def _pixel_information(self) -> tuple[Array, npt.NDArray[np.bool_]]:
+        """Sum (M,) of what is known of a pixel over its directions, and whether that is both."""
+        W = self.pixel_whitener
+        information = np.asarray(np.einsum("mij,mij->m", W, W))
+        return information, np.abs(_determinant(W)) > 1e-6 * information
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -235,6 +247,10 @@ def adjusted_intrinsics(color: Intrinsics, state: Array) -> Intrinsics:
         cy=color.cy + float(state[2]),
         dist=(k1 + float(state[3]), k2, p1, p2, k3),
     )
+
+
+def _determinant(W: Array) -> Array:
+    return np.asarray(W[:, 0, 0] * W[:, 1, 1] - W[:, 0, 1] * W[:, 1, 0])
 
 
 def _numbers(intrinsics: Intrinsics) -> tuple[float, ...]:

@@ -171,7 +171,7 @@ def _with_floor(information: Array) -> Array:
 
 def _spread_pixels(image: ImageF32) -> Index:
     """In every cell of the image the pixel (column, row) whose neighbourhood has most texture."""
-    texture = cv2.cornerMinEigenVal(image, 7, 3)
+    texture = cv2.cornerMinEigenVal(image, blockSize=7, ksize=3)
     height, width = image.shape
     rows, columns = (height - 2 * RADIUS_PX) // _CELL_PX, (width - 2 * RADIUS_PX) // _CELL_PX
     part = texture[RADIUS_PX : RADIUS_PX + rows * _CELL_PX, RADIUS_PX : RADIUS_PX + columns * _CELL_PX]

@@ -16,8 +16,10 @@ from rig_protocol.poses import Pose, hat, inverse, se3_exp, transform_points
 Array = npt.NDArray[np.float64]
 Mask = npt.NDArray[np.bool_]
 
-_BATCH = 256  # hypotheses scored at once
-_MAX_BATCHES = 16
+# Hypotheses scored at once: few at first, since most matches of a good pair are true, then twice as many
+# every time.
+_FIRST_BATCH, _LARGEST_BATCH = 32, 256
+_MAX_TRIALS = 4096
 _CONFIDENCE = 0.9999
 _POLISH_ROUNDS = 4
 _MIN_SAMPLE_SIDE_M = 0.1  # closer points turn noise into rotation
@@ -63,22 +65,16 @@ def ransac(
     both = np.flatnonzero(i.known & j.known)
     if len(both) < 3:
         return None
-    best, best_count, tried = np.eye(4), 0, 0
-    for _ in range(_MAX_BATCHES):
-        samples = (
-            both[rng.random((_BATCH, len(both))).argpartition(2, axis=1)[:, :3]]
-            if len(both) > 3
-            else both[None]
-        )
-        tried += len(samples)
+    best, best_count, tried, batch = np.eye(4), 0, 0, _FIRST_BATCH
+    while tried < min(_MAX_TRIALS, _trials_needed(best_count / len(i.pixels))):
+        samples = _triples(both, batch, rng)
+        tried, batch = tried + batch, min(2 * batch, _LARGEST_BATCH)
         samples = samples[_plausible(i.points[samples], j.points[samples], tolerance)]
         if len(samples):
             poses = align_batch(i.points[samples], j.points[samples])
             counts = _agreeing_all(poses, i, j, tolerance).sum(axis=1)
             if counts.max() > best_count:
                 best, best_count = poses[counts.argmax()], int(counts.max())
-        if tried >= _trials_needed(best_count / len(i.pixels)):
-            break
     return _polish(best, i, j, tolerance, min_inliers)
 
 
@@ -124,6 +120,13 @@ def _kabsch(covariance: Array, mean_i: Array, mean_j: Array) -> Array:
     T[..., :3, 3] = mean_i - np.einsum("...ij,...j->...i", T[..., :3, :3], mean_j)
     T[..., 3, 3] = 1.0
     return T
+
+
+def _triples(rows: npt.NDArray[np.intp], count: int, rng: np.random.Generator) -> npt.NDArray[np.intp]:
+    """Random triples (count,3) of different rows."""
+    if len(rows) == 3:
+        return rows[None]
+    return np.asarray(rows[rng.random((count, len(rows))).argpartition(2, axis=1)[:, :3]])
 
 
 def _plausible(p_i: Array, p_j: Array, tolerance: Tolerance) -> Mask:

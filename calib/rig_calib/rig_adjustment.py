@@ -15,6 +15,7 @@ from rig_calib.observed_camera import ObservedCamera
 from rig_calib.projection import from_pixels
 from rig_calib.settings import CalibrationSettings
 from rig_calib.tracks import Scene, build_scene, build_tracks
+from rig_calib.view import CameraView
 from rig_calib.uncertainty import PoseCovariance, pose_covariance
 from rig_protocol.camera import ModelSource
 from rig_protocol.poses import Pose, inverse
@@ -56,7 +57,7 @@ class ModelSigma:
 
 # Units differ from the common default by a percent, several pixels, and their lens's distortion.
 _MEASURED = ModelSigma(0.001, 0.6, 0.001, 0.04, 0.0005, 0.001, 0.6)
-MODEL_SIGMA: Mapping[ModelSource, ModelSigma] = {
+_MODEL_SIGMA: Mapping[ModelSource, ModelSigma] = {
     "factory": _MEASURED,
     "file": _MEASURED,
     "default": ModelSigma(0.01, 5.0, 0.1, 0.5, 0.003, 0.01, 5.0),
@@ -134,11 +135,20 @@ def adjust_rig(
     )
 
 
+def model_sigmas(view: CameraView) -> dict[str, Array]:
+    """How far a view's models may be off, as the fields of `AdjustedCamera` that say it."""
+    sigma, own_grid = _MODEL_SIGMA[view.model.source], view.depth_frame == "depth"
+    return {
+        "intrinsics_sigma": sigma.intrinsics,
+        "grid_pose_sigma": sigma.grid_pose if own_grid else np.zeros(GRID_POSE_TERMS),
+        "grid_intrinsics_sigma": sigma.grid_intrinsics if own_grid else np.zeros(GRID_INTRINSIC_TERMS),
+    }
+
+
 def _adjusted_camera(
     camera: ObservedCamera, start: Pose, ring: RingDrawing | None, fixed: bool, settings: CalibrationSettings
 ) -> AdjustedCamera:
-    model, own_grid = camera.view.model, camera.view.depth_frame == "depth"
-    sigma = MODEL_SIGMA[model.source]
+    model = camera.view.model
     pose_sigma = None
     if ring is not None:
         pose_sigma = np.repeat([np.deg2rad(ring.tolerance_deg), ring.tolerance_m], 3)
@@ -147,9 +157,7 @@ def _adjusted_camera(
         grid=camera.grid,
         start=CameraState(start, np.zeros(settings.bias_terms)),
         bias_sigma=bias_sigma(camera.grid, settings),
-        intrinsics_sigma=sigma.intrinsics,
-        grid_pose_sigma=sigma.grid_pose if own_grid else np.zeros(GRID_POSE_TERMS),
-        grid_intrinsics_sigma=sigma.grid_intrinsics if own_grid else np.zeros(GRID_INTRINSIC_TERMS),
+        **model_sigmas(camera.view),
         T_prior=None if ring is None else camera.view.T_rig_nominal,
         pose_sigma=pose_sigma,
         fixed_pose=fixed,

@@ -33,7 +33,7 @@ def rotation_vectors(R: Array) -> Array:
     out = axis * scale[:, None]
     for c in np.flatnonzero((cosine < 0.0) & (sine < _NEAR_HALF_TURN)):
         out[c] = so3_log(R[c])
-    return out
+    return np.asarray(out)
 
 
 def _factors(phi: Array) -> tuple[Array, Array, Array]:

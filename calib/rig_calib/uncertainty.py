@@ -5,6 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
+import scipy.linalg
 
 from rig_calib.bundle_adjustment import AdjustedCamera, Adjustment
 from rig_calib.observation_model import POSE
@@ -52,14 +53,15 @@ def pose_covariance(adjustment: Adjustment, cameras: Sequence[AdjustedCamera]) -
     """
     count = len(cameras)
     size = len(adjustment.normal) // count
-    free = np.ones((count, size), dtype=bool)
-    free[[c for c, camera in enumerate(cameras) if camera.fixed_pose], POSE] = False
-    rows = np.flatnonzero(free)
-    information = adjustment.normal[np.ix_(rows, rows)] + _VAGUE_INFORMATION * np.eye(len(rows))
-    covariance = np.asarray(np.linalg.inv(information), dtype=np.float64)
-    full = np.zeros((count * size, count * size))
-    full[np.ix_(rows, rows)] = 0.5 * (covariance + covariance.T)
-    return PoseCovariance(full.reshape(count, size, count, size)[:, POSE, :, POSE])
+    information = adjustment.normal + _VAGUE_INFORMATION * np.eye(count * size)
+    poses = np.arange(count * size).reshape(count, size)[:, POSE].ravel()
+    factor = scipy.linalg.cho_factor(information, lower=True, check_finite=False)
+    covariance = scipy.linalg.cho_solve(factor, np.eye(count * size)[:, poses])[poses]
+    blocks = (0.5 * (covariance + covariance.T)).reshape(count, 6, count, 6)
+    for c, camera in enumerate(cameras):
+        if camera.fixed_pose:
+            blocks[c] = blocks[:, :, c] = 0.0
+    return PoseCovariance(blocks)
 
 
 def _alignment_residual(poses: Sequence[Pose]) -> Array:

@@ -228,3 +228,4 @@ def test_whitened_residuals_become_pixels_again() -> None:
     seen = replace(observations()[1].select(np.arange(3)), pixel_whitener=W)
     expected = np.stack([error[0], across @ error[1], [0.0, 0.0]])
     np.testing.assert_allclose(seen.pixel_error(np.einsum("mij,mj->mi", W, error)), expected)
+    np.testing.assert_allclose(seen.pixel_sigma, [0.5, 0.5, np.inf])
