@@ -1,8 +1,7 @@
 """What can be wrong with a rig or a room, one noun each: the reference scene and its troubled sisters."""
 
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager, nullcontext
-from contextlib import AbstractContextManager
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from dataclasses import dataclass, field
 from typing import Any
 from unittest.mock import patch
@@ -31,7 +30,7 @@ class Scenario:
 @contextmanager
 def _wrong_matches(seed: int) -> Iterator[None]:
     """Of every pair's matches a share is replaced by random pairings, before anything looks at them."""
-    match = calibration._match  # noqa: SLF001
+    match = calibration._match
     rng = np.random.default_rng([seed, 404])
 
     def spoilt(*arguments: Any) -> Any:

@@ -25,6 +25,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from calibration_scenarios import SCENARIOS
 from calibration_trial import Consistency, Trial, run_trial
+
 from rig_calib.settings import CalibrationSettings
 from support.rendered_rig import rendered_rig
 
@@ -98,8 +99,8 @@ def report(done: Sequence[Trial]) -> str:
     errors = [error for trial in solved for error in trial.edges.values()]
     opposite = [error for trial in solved for error in trial.opposite]
     lines = [
-        f"mean edge {np.mean([e.deg for e in errors]):.4f}° {np.mean([e.mm for e in errors]):.3f} mm, "
-        f"RMSE {rms(e.deg for e in errors):.4f}° {rms(e.mm for e in errors):.3f} mm",
+        f"mean edge {np.mean([e.deg for e in errors]):.4f}° {np.mean([e.mm for e in errors]):.3f} mm",
+        f"RMSE edge {rms(e.deg for e in errors):.4f}° {rms(e.mm for e in errors):.3f} mm",
         f"opposite {np.mean([e.deg for e in opposite]):.4f}° {np.mean([e.mm for e in opposite]):.3f} mm",
     ]
     for name, each in (
