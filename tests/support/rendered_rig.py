@@ -1,8 +1,8 @@
 """Views of the simulated ring, rendered once: what a study runs on again and again."""
 
 import hashlib
-from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -27,14 +27,13 @@ class RenderedRig:
     views: tuple[CameraView, ...]
     ring: RingDrawing
     truth: Mapping[int, Pose]
+    folder: Path
+    """Where what was computed of this rig is kept."""
 
-    def first(self, frames: int) -> "RenderedRig":
-        """The same rig with fewer frames."""
-        views = (
-            replace(view, color=view.color[:frames], raw=view.raw[:frames], depth_mm=view.depth_mm[:frames])
-            for view in self.views
-        )
-        return replace(self, views=tuple(views))
+    @property
+    def frames(self) -> int:
+        """How many frames the views hold."""
+        return len(self.views[0].color)
 
     @property
     def nominal(self) -> dict[int, Pose]:
@@ -47,14 +46,15 @@ def rendered_rig(settings: SimulatorSettings, frames: int) -> RenderedRig:
 
     Frames are kept one file each, under a name that changes with the settings and the simulator's code.
     """
-    folder = CACHE / _key(settings)
+    simulator = Path(rig_agent.simulator.__path__[0]).glob("*.py")
+    folder = CACHE / f"room_{settings.seed:03d}_{code_hash(simulator, settings.model_dump_json())}"
     description = rig_description(settings)
     if description.ring is None:
         raise ValueError("the simulator draws a ring")
     rig = VirtualRig(settings)
     panoramas = [_panorama(rig, folder / f"{k:03d}.npz", k) for k in range(frames)]
     views = views_from_panoramas(description, panoramas)
-    return RenderedRig(settings, tuple(views), description.ring, true_poses(settings))
+    return RenderedRig(settings, tuple(views), description.ring, true_poses(settings), folder)
 
 
 def _panorama(rig: VirtualRig, path: Path, k: int) -> PanoramicFrame:
@@ -75,8 +75,9 @@ def _store(path: Path, frames: Mapping[int, RgbdFrame]) -> None:
     whole.replace(path)
 
 
-def _key(settings: SimulatorSettings) -> str:
-    digest = hashlib.sha256(settings.model_dump_json().encode())
-    for module in sorted(Path(rig_agent.simulator.__path__[0]).glob("*.py")):
+def code_hash(modules: Iterable[Path], *more: str) -> str:
+    """A name for what some code makes of something."""
+    digest = hashlib.sha256("".join(more).encode())
+    for module in sorted(modules):
         digest.update(module.read_bytes())
-    return f"room_{settings.seed:03d}_{digest.hexdigest()[:16]}"
+    return digest.hexdigest()[:16]
