@@ -46,6 +46,7 @@ def _wrong_matches(seed: int) -> Iterator[None]:
 
 SCENARIOS: Mapping[str, Scenario] = {
     "reference": Scenario("reference scene"),
+    "screened": Scenario("one overlap blocked", lambda seed: {"screened_overlap": (5 * seed + 1) % 12}),
     "knock": Scenario(
         "one camera bumped by 4° and 3 cm", lambda seed: {"knock": {"camera": (5 * seed + 3) % 12}}
     ),

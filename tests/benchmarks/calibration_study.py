@@ -11,52 +11,26 @@ os.environ.setdefault("NUMBA_NUM_THREADS", "1")
 import argparse
 import multiprocessing
 import sys
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
+from typing import Literal
 
 import cv2
 import numpy as np
-from scipy import stats
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from calibration_scenarios import SCENARIOS
-from calibration_trial import Consistency, Trial, run_trial
+from calibration_summary import BoundedTrial, Efficiency, summary
+from calibration_trial import run_trial
 
 from rig_calib.settings import CalibrationSettings
 from support.rendered_rig import rendered_rig
-from support.scene_bound import SceneBound, scene_bound
+from support.scene_bound import scene_bound
 
-
-@dataclass(frozen=True, slots=True)
-class BoundedTrial:
-    """A trial, and what no estimator can do better in its scene."""
-
-    trial: Trial
-    bound: SceneBound | None
-
-
-@dataclass(frozen=True, slots=True)
-class Nees:
-    """Mean normalised error squared over trials, and the 95 % interval in which it should lie."""
-
-    mean: float
-    low: float
-    high: float
-
-    @classmethod
-    def of(cls, each: Iterable[Consistency | None]) -> "Nees | None":
-        """Over trials, which are independent."""
-        known = [one for one in each if one is not None]
-        if not known:
-            return None
-        # a sum of scaled χ²: variances 2/dof add, the mean's is their mean over n
-        dof = len(known) ** 2 / sum(1 / one.dof for one in known)
-        low, high = stats.chi2.ppf((0.025, 0.975), dof) / dof
-        return cls(float(np.mean([one.nees for one in known])), float(low), float(high))
+Bounded = Literal["always", "refused", "never"]
 
 
 def trials(
@@ -66,9 +40,12 @@ def trials(
     jobs: int = 2,
     settings: CalibrationSettings | None = None,
     *,
-    bounded: bool = False,
+    bounded: Bounded = "never",
 ) -> Iterator[BoundedTrial]:
-    """Trials in the order of the seeds, each as soon as it and those before it are done."""
+    """Trials in the order of the seeds, each as soon as it and those before it are done.
+
+    `bounded`: which of them get their scene's bound, which takes ten seconds once.
+    """
     work = partial(_trial, scenario, frames, settings, bounded)
     if jobs == 1:
         yield from map(work, seeds)
@@ -82,101 +59,52 @@ def _single_threaded() -> None:
 
 
 def _trial(
-    scenario: str, frames: int, settings: CalibrationSettings | None, bounded: bool, seed: int
+    scenario: str, frames: int, settings: CalibrationSettings | None, bounded: Bounded, seed: int
 ) -> BoundedTrial:
     chosen = SCENARIOS[scenario]
     rig = rendered_rig(chosen.settings(seed), frames)
     with chosen.disturbed(seed):
         trial = run_trial(seed, rig.views, rig.ring, rig.truth, settings)
-    return BoundedTrial(trial, scene_bound(rig) if bounded else None)
-
-
-@dataclass(frozen=True, slots=True)
-class Efficiency:
-    """Bound over observed root mean square error of the neighbours' poses, over trials and edges.
-
-    1: no estimator from the same measurements is better. `rmse` and `bound` are (degrees, millimetres).
-    """
-
-    rmse: tuple[float, float]
-    bound: tuple[float, float]
-    of_images: tuple[float, float]
-
-    @classmethod
-    def of(cls, done: Sequence[BoundedTrial]) -> "Efficiency | None":
-        """Over trials that have all their edges and a bound."""
-        known = [(one.trial, one.bound) for one in done if one.bound is not None and one.trial.edges]
-        if not known:
-            return None
-        errors = [(error.deg, error.mm) for trial, _ in known for error in trial.edges.values()]
-        least = [bound.neighbours[pair] for trial, bound in known for pair in trial.edges]
-        of_images = [bound.of_images[pair] for trial, bound in known for pair in trial.edges]
-        return cls(rms_of_each(errors), rms_of_each(least), rms_of_each(of_images))
-
-    @property
-    def deg(self) -> float:
-        """Of rotations."""
-        return self.bound[0] / self.rmse[0]
-
-    @property
-    def mm(self) -> float:
-        """Of translations."""
-        return self.bound[1] / self.rmse[1]
-
-
-def rms_of_each(rows: Sequence[tuple[float, float]]) -> tuple[float, float]:
-    """Root mean squares of both columns."""
-    return rms(row[0] for row in rows), rms(row[1] for row in rows)
-
-
-def rms(values: Iterable[float]) -> float:
-    """Root of the mean of the squares."""
-    return float(np.sqrt(np.mean(np.square(list(values)))))
+    wanted = bounded == "always" or (bounded == "refused" and bool(trial.failures))
+    return BoundedTrial(trial, scene_bound(rig) if wanted else None)
 
 
 def _line(one: BoundedTrial) -> str:
     trial = one.trial
-    efficiency = Efficiency.of([one])
-    shown = "          " if efficiency is None else f"{efficiency.deg:4.2f} {efficiency.mm:4.2f} "
+    known = Efficiency.of([one])
+    efficiency = " " * 9 if known is None else f"{known.deg:4.2f} {known.mm:4.2f}"
     nees = "     " if trial.pairs_nees is None else f"{trial.pairs_nees.nees:5.2f}"
     cameras = "     " if trial.cameras_nees is None else f"{trial.cameras_nees.nees:5.2f}"
-    worst = max(trial.edges.values(), key=lambda error: error.mm, default=None)
+    worst = max((error.mm for error in trial.edges.values()), default=np.nan)
     return (
-        f"{trial.seed:4d} {trial.deg:7.4f} {trial.mm:7.3f}  {0.0 if worst is None else worst.mm:7.2f} "
-        f"{trial.absolute_mm:8.2f} {trial.nominal_mm:8.2f}  {nees} {cameras} {shown} {trial.matches:6d} "
-        f"{trial.seconds['total']:6.2f}  {'; '.join(trial.failures)[:90]}"
+        f"{trial.seed:4d} {trial.deg:7.4f} {trial.mm:7.3f} {worst:9.2f} "
+        f"{trial.absolute_mm:7.2f} {trial.nominal_mm:9.2f} {nees} {cameras}  {efficiency} {trial.matches:8d} "
+        f"{trial.seconds['total']:8.3f}  {'; '.join(trial.failures)[:90]}"
     )
 
 
-def report(bounded: Sequence[BoundedTrial]) -> str:
+def report(done: Sequence[BoundedTrial]) -> str:
     """Means over the trials."""
-    done = [one.trial for one in bounded]
-    solved = [trial for trial in done if trial.edges]
-    errors = [error for trial in solved for error in trial.edges.values()]
-    opposite = [error for trial in solved for error in trial.opposite]
+    figures = summary(done)
     lines = [
-        f"mean edge {np.mean([e.deg for e in errors]):.4f}° {np.mean([e.mm for e in errors]):.3f} mm",
-        f"RMSE edge {rms(e.deg for e in errors):.4f}° {rms(e.mm for e in errors):.3f} mm",
-        f"opposite {np.mean([e.deg for e in opposite]):.4f}° {np.mean([e.mm for e in opposite]):.3f} mm",
+        f"mean edge  {figures['deg']:.4f}° {figures['mm']:.3f} mm",
+        f"opposite   {figures['opposite_deg']:.4f}° {figures['opposite_mm']:.3f} mm",
     ]
-    known = Efficiency.of(bounded)
-    if known is not None:
+    if "efficiency" in figures:
         lines += [
-            f"bound     {known.bound[0]:.4f}° {known.bound[1]:.3f} mm",
-            f"efficiency {known.deg:.3f} {known.mm:.3f}",
-            f"of images {known.of_images[0]:.4f}° {known.of_images[1]:.3f} mm",
+            f"RMSE edge  {figures['rmse_deg']:.4f}° {figures['rmse_mm']:.3f} mm",
+            f"bound      {figures['bound_deg']:.4f}° {figures['bound_mm']:.3f} mm",
+            f"of images  {figures['bound_of_images_deg']:.4f}° {figures['bound_of_images_mm']:.3f} mm",
+            f"efficiency {figures['efficiency_deg']:.3f} {figures['efficiency_mm']:.3f}",
         ]
-    for name, each in (
-        ("pairs", [trial.pairs_nees for trial in solved]),
-        ("cameras", [trial.cameras_nees for trial in solved]),
-    ):
-        nees = Nees.of(each)
-        if nees is not None:
-            lines.append(f"NEES/dof {name} {nees.mean:.3f} (95 %: {nees.low:.3f} to {nees.high:.3f})")
-    seconds = {key: np.mean([trial.seconds[key] for trial in done]) for key in done[0].seconds}
-    lines.append("seconds " + ", ".join(f"{key} {value:.3f}" for key, value in seconds.items()))
-    better = sum(trial.absolute_mm <= trial.nominal_mm for trial in done)
-    lines.append(f"not worse than the drawing: {better} of {len(done)}")
+    for name, key in (("pairs", "nees"), ("cameras", "nees_cameras")):
+        if key in figures:
+            low, high = figures[f"{key}_low"], figures[f"{key}_high"]
+            lines.append(f"NEES/dof   {figures[key]:.3f} {name} (95 %: {low:.3f} to {high:.3f})")
+    stages = done[0].trial.seconds
+    seconds = {stage: np.mean([one.trial.seconds[stage] for one in done]) for stage in stages}
+    lines.append("seconds " + ", ".join(f"{stage} {value:.3f}" for stage, value in seconds.items()))
+    lines.append(f"not worse than the drawing: {100 * figures['not_worse_than_drawing']:.0f} %")
     return "\n".join(lines)
 
 
@@ -198,9 +126,9 @@ def main() -> None:
     parser.add_argument("--jobs", type=int, default=2)
     parser.add_argument("--no-bound", action="store_true", help="leave the Cramér-Rao bound out")
     known = parser.parse_args()
-    bounded = not known.no_bound and known.scenario == "reference"
+    bounded: Bounded = "never" if known.no_bound or known.scenario != "reference" else "always"
     print(
-        "seed     deg      mm  worst mm  abs mm  drawn mm  NEES  cams   efficiency  inliers seconds  failures"
+        "seed     deg      mm  worst mm  abs mm  drawn mm  NEES  cams  efficiency  inliers  seconds  failures"
     )
     done = []
     for one in trials(known.scenario, known.seeds, known.frames, known.jobs, bounded=bounded):

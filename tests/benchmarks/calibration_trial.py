@@ -32,7 +32,7 @@ class Consistency:
 
 @dataclass(frozen=True, slots=True)
 class Trial:
-    """What came of one calibration. `covered`: every pair's error lies within its own 99.9 % region."""
+    """What came of one calibration; errors of the drawing are those of the cameras that were placed."""
 
     seed: int
     seconds: Mapping[str, float]
@@ -76,8 +76,9 @@ def judge(
     """Errors of a result and what it said about them."""
     calibration = result.calibration
     nominal = {view.camera_id: view.T_rig_nominal for view in views if view.T_rig_nominal is not None}
-    drawn = evaluate(nominal, truth) if nominal else None
     found = evaluate(calibration, truth) if calibration.poses else None
+    placed = {camera: nominal[camera] for camera in nominal.keys() & calibration.poses.keys()}
+    drawn = evaluate(placed, truth) if placed else None
     rig = result.rig
     neighbours = () if found is None else found.neighbours
     return Trial(

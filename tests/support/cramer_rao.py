@@ -207,7 +207,7 @@ def _is_flat(true: TrueRig, camera: int, pixels: Array, planes: Array, size: int
     same = np.repeat(planes, _WINDOW_SAMPLES**2, axis=0)
     expected = (same * np.column_stack([rays, np.ones(len(rays))])).sum(axis=1)
     off_lsb = unit.raw_model.numerator_m * np.abs(1 / hits.points[:, 2] - expected)
-    return np.asarray((off_lsb.reshape(len(pixels), -1) < _FLAT_LSB).all(axis=1))
+    return np.asarray((off_lsb.reshape(len(pixels), _WINDOW_SAMPLES**2) < _FLAT_LSB).all(axis=1))
 
 
 def _filled(valid: Array, pixels: Array, size: int) -> Array:
@@ -224,6 +224,8 @@ def _filled(valid: Array, pixels: Array, size: int) -> Array:
 def _shared_noise(seen: _Disparity) -> Array:
     """Derivatives (M,3,K) by the unit normal modes of the noise that disparities share."""
     known = np.flatnonzero(seen.half_px > 0)
+    if not len(known):
+        return np.zeros((len(seen.half_px), 3, 0))
     covariance = np.zeros((len(known), len(known)))
     offsets = seen.pixels[known][:, None] - seen.pixels[known][None]
     half = seen.half_px[known]

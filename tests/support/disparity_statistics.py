@@ -2,7 +2,6 @@
 
 from functools import cache
 
-import cv2
 import numpy as np
 import numpy.typing as npt
 import scipy.ndimage
@@ -69,11 +68,8 @@ def distortion_modes(pixels: Array, shape: tuple[int, int]) -> Array:
     """
     modes = _principal_fields()
     scale = (np.array(_FIELD_SHAPE) / shape)[::-1]
-    at = ((pixels + 0.5) * scale - 0.5).astype(np.float32)[:, None]
-    sampled = [
-        cv2.remap(mode, at[..., 0], at[..., 1], cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)[:, 0]
-        for mode in modes
-    ]
+    columns, rows = ((pixels + 0.5) * scale - 0.5).T
+    sampled = [scipy.ndimage.map_coordinates(mode, [rows, columns], mode="nearest") for mode in modes]
     return np.asarray(np.stack(sampled, axis=1), dtype=np.float64)
 
 
