@@ -11,11 +11,11 @@ os.environ.setdefault("NUMBA_NUM_THREADS", "1")
 import argparse
 import multiprocessing
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from functools import partial
 from pathlib import Path
-from typing import Literal
+from typing import Literal, TypeVar
 
 import cv2
 import numpy as np
@@ -31,6 +31,8 @@ from support.rendered_rig import rendered_rig
 from support.scene_bound import scene_bound
 
 Bounded = Literal["always", "refused", "never"]
+Item = TypeVar("Item")
+Result = TypeVar("Result")
 
 
 def trials(
@@ -46,12 +48,16 @@ def trials(
 
     `bounded`: which of them get their scene's bound, which takes ten seconds once.
     """
-    work = partial(_trial, scenario, frames, settings, bounded)
+    yield from in_processes(partial(_trial, scenario, frames, settings, bounded), seeds, jobs)
+
+
+def in_processes(work: Callable[[Item], Result], items: Sequence[Item], jobs: int = 2) -> Iterator[Result]:
+    """Results in the order of the items, from single-threaded processes."""
     if jobs == 1:
-        yield from map(work, seeds)
+        yield from map(work, items)
         return
     with ProcessPoolExecutor(jobs, multiprocessing.get_context("spawn"), _single_threaded) as pool:
-        yield from pool.map(work, seeds)
+        yield from pool.map(work, items)
 
 
 def _single_threaded() -> None:

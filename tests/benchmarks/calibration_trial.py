@@ -40,6 +40,7 @@ class Trial:
     warnings: tuple[str, ...]
     missing: tuple[int, ...]
     edges: Mapping[Pair, PoseError]
+    near: tuple[PoseError, ...]
     opposite: tuple[PoseError, ...]
     absolute_mm: float
     nominal_mm: float
@@ -88,6 +89,7 @@ def judge(
         warnings=calibration.warnings,
         missing=tuple(sorted(truth)) if found is None else found.missing,
         edges={} if found is None else {pair: found.pairs[pair] for pair in neighbours},
+        near=() if found is None else tuple(found.pairs[pair] for pair in found.near),
         opposite=() if found is None else _opposite(found, truth),
         absolute_mm=_mean_absolute_mm(found),
         nominal_mm=_mean_absolute_mm(drawn),
