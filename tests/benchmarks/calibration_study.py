@@ -131,13 +131,17 @@ def main() -> None:
     parser.add_argument("--scenario", choices=list(SCENARIOS), default="reference")
     parser.add_argument("--jobs", type=int, default=2)
     parser.add_argument("--no-bound", action="store_true", help="leave the Cramér-Rao bound out")
+    parser.add_argument(
+        "--set", metavar="NAME=VALUE", action="append", default=[], help="a setting of the calibration"
+    )
     known = parser.parse_args()
+    settings = CalibrationSettings.model_validate(dict(one.split("=", 1) for one in known.set))
     bounded: Bounded = "never" if known.no_bound or known.scenario != "reference" else "always"
     print(
         "seed     deg      mm  worst mm  abs mm  drawn mm  NEES  cams  efficiency  inliers  seconds  failures"
     )
     done = []
-    for one in trials(known.scenario, known.seeds, known.frames, known.jobs, bounded=bounded):
+    for one in trials(known.scenario, known.seeds, known.frames, known.jobs, settings, bounded=bounded):
         done.append(one)
         print(_line(one), flush=True)
     print(report(done))
