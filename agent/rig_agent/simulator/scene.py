@@ -17,7 +17,7 @@ _KEEP_OUT_M = 0.95  # a Kinect measures from 0.5 m on, and people must reach the
 _WALL_GAP_M = 0.03  # furniture stands off the wall, so that patterns do not pierce it
 _CORNER_M = 0.55  # half of the widest tall piece: nearer to a corner it would stand beside the overlap
 _PATTERN_TEXEL_M = 0.002
-# A screen: where neighbours' fields begin to overlap, 0.7 m from the axis, they share a few centimetres of it.
+# Neighbours' fields begin to overlap 0.7 m from the axis: of a screen there they share a few centimetres.
 _SCREEN_OFF_M, _SCREEN_M = 0.8, (0.5, 0.04, 2.0)
 
 
