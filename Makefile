@@ -5,7 +5,7 @@ BIN    := $(VENV)/bin
 READY  := $(VENV)/.ready
 BENCH  := $(VENV)/.ready-bench
 
-.PHONY: demo test lint bench bench-codecs bench-transport soak fuzz docs clean
+.PHONY: demo test lint bench bench-codecs bench-transport bench-calibration soak fuzz docs clean
 
 demo: $(READY)  ## twelve simulated Kinects over loopback UDP, calibrated and fused into build/demo
 	$(BIN)/rig-server --calibrate --simulate 12 --frames 5 --out build/demo
@@ -33,7 +33,10 @@ fuzz: $(VENV)/.ready-fuzz  ## every parser of strangers' bytes, 100 s each: FUZZ
 bench-transport: $(BENCH) bench-codecs  ## the transport against its bars and its peers, into docs/performance.md
 	$(BIN)/python tests/benchmarks/bench_transport.py
 
-bench: bench-transport  ## all figures, into build/bench.json
+bench-calibration: $(BENCH)  ## the calibration against its bars, the bound and its peers, into docs/accuracy.md
+	$(BIN)/python tests/benchmarks/bench_calibration.py
+
+bench: bench-transport bench-calibration  ## all figures, into build/bench.json
 
 docs: $(READY)  ## the pages that are made from the code
 	$(BIN)/python docs/generate_configuration.py

@@ -5,24 +5,12 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-import matplotlib as mpl
-
-mpl.use("svg")
-import matplotlib.pyplot as plt
 from matplotlib.axes import Axes
 
-from support.benchmark_record import REPOSITORY, machine, markdown_table
+from support.benchmark_record import machine, markdown_table
+from support.pictures import picture
 
-IMAGES = REPOSITORY / "docs" / "images"
 FIRST_VERSION = Path(__file__).with_name("transport_first_version.json")
-_STYLE = {
-    "svg.hashsalt": "kinect-rig",  # the same figures give the same file
-    "svg.fonttype": "none",
-    "font.size": 9,
-    "axes.spines.top": False,
-    "axes.spines.right": False,
-    "figure.constrained_layout.use": True,
-}
 _INCOMPLETE_BAR, _ADDED_BAR_MS = 0.1, 10.0  # at 5 % loss: percent of sets, and of p99
 _COLORS = {"receiver": "#4477aa", "decoder": "#ee8866", "others": "#bbbbbb", "MainThread": "#44bb99"}
 _THREADS = {
@@ -51,7 +39,7 @@ def page(results: Mapping[str, Section]) -> str:
 def _rig(section: Section) -> str:
     first = json.loads(FIRST_VERSION.read_text())
     columns = [("first version", first["rig"]), ("now", section)]
-    _picture("transport_rig", (6.4, 1.6), lambda axes: _draw_threads(axes, columns))
+    picture("transport_rig", (6.4, 1.6), lambda axes: _draw_threads(axes, columns))
     rows = [[label, *(form(one) for _, one in columns), bar] for label, form, bar in _RIG_ROWS]
     table = markdown_table(["", *(name for name, _ in columns), "bar"], rows)
     return f"""### {_TITLES["rig"]}
@@ -108,7 +96,7 @@ def _peers(section: Section) -> str:
         "frames lost",
         "... at 1 % drops",
     ]
-    _picture("transport_peers", (6.4, 1.8), lambda axes: _draw_peers(axes, section))
+    picture("transport_peers", (6.4, 1.8), lambda axes: _draw_peers(axes, section))
     return f"""### {_TITLES["peers"]}
 
 The rig's frames, whole ones counted, between two network namespaces with Ethernet's frame size; a frame
@@ -131,7 +119,7 @@ def _recovery(section: Section) -> str:
         ]
         for one in section
     ]
-    _picture("transport_recovery", (6.4, 2.4), lambda axes: _draw_recovery(axes, section))
+    picture("transport_recovery", (6.4, 2.4), lambda axes: _draw_recovery(axes, section))
     header = ["fault", "sets", "incomplete", "added p99 ms", "fragments resent"]
     return f"""### {_TITLES["recovery"]}
 
@@ -234,16 +222,6 @@ _RIG_ROWS: Sequence[tuple[str, Callable[[Section], str], str]] = (
     ("cores that other programs took meanwhile", lambda one: f"{one['others_cores']:.2f}", ""),
     ("authenticated", lambda one: "yes" if one["authenticated"] else "no", "yes"),
 )
-
-
-def _picture(name: str, inches: tuple[float, float], draw: Callable[[Axes], None]) -> None:
-    """A small SVG without a date."""
-    with mpl.rc_context(_STYLE):  # type: ignore[arg-type]  # a plain dict of settings
-        figure, axes = plt.subplots(figsize=inches)
-        draw(axes)
-        IMAGES.mkdir(exist_ok=True)
-        figure.savefig(IMAGES / f"{name}.svg", metadata={"Date": None})
-        plt.close(figure)
 
 
 def _draw_threads(axes: Axes, columns: Sequence[tuple[str, Section]]) -> None:

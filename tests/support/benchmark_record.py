@@ -1,4 +1,4 @@
-"""Where benchmarks leave their figures: build/bench.json and marked sections of docs/performance.md."""
+"""Where benchmarks leave their figures: build/bench.json and marked sections of pages under docs/."""
 
 import json
 import platform
@@ -24,15 +24,20 @@ def merge_results(sections: Mapping[str, Any]) -> None:
     RESULTS.write_text(json.dumps(results, indent=1) + "\n")
 
 
-def write_section(name: str, text: str) -> None:
-    """Replace what stands between the markers `name:begin` and `name:end` of docs/performance.md."""
+def results_of(section: str) -> Any:
+    """What build/bench.json holds of a section; None when that is nothing."""
+    return json.loads(RESULTS.read_text()).get(section) if RESULTS.exists() else None
+
+
+def write_section(name: str, text: str, target: Path = PERFORMANCE) -> None:
+    """Replace what stands between the markers `name:begin` and `name:end` of a page (docs/performance.md)."""
     begin, end = f"<!-- {name}:begin -->", f"<!-- {name}:end -->"
-    page = PERFORMANCE.read_text() if PERFORMANCE.exists() else _TITLE
+    page = target.read_text() if target.exists() else _TITLE
     if begin not in page:
         page += f"\n{begin}\n{end}\n"
     before, rest = page.split(begin, 1)
     _, after = rest.split(end, 1)
-    PERFORMANCE.write_text(f"{before}{begin}\n{text.strip()}\n{end}{after}")
+    target.write_text(f"{before}{begin}\n{text.strip()}\n{end}{after}")
 
 
 def markdown_table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:

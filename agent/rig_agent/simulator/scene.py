@@ -8,7 +8,7 @@ import numpy.typing as npt
 from rig_agent.simulator.furniture import LOW, TALL, Piece
 from rig_agent.simulator.settings import SimulatorSettings
 from rig_agent.simulator.streams import Stream, generator
-from rig_agent.simulator.surface import Surface
+from rig_agent.simulator.surface import Box, Surface
 from rig_protocol.poses import Pose
 
 Vector = npt.NDArray[np.float64]
@@ -17,6 +17,8 @@ _KEEP_OUT_M = 0.95  # a Kinect measures from 0.5 m on, and people must reach the
 _WALL_GAP_M = 0.03  # furniture stands off the wall, so that patterns do not pierce it
 _CORNER_M = 0.55  # half of the widest tall piece: nearer to a corner it would stand beside the overlap
 _PATTERN_TEXEL_M = 0.002
+# Neighbours' fields begin to overlap 0.7 m from the axis: of a screen there they share a few centimetres.
+_SCREEN_OFF_M, _SCREEN_M = 0.8, (0.5, 0.04, 2.0)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -63,6 +65,8 @@ def build_scene(settings: SimulatorSettings) -> Scene:
     surfaces += _furniture(rng, settings, walls, targets, T_room_rig[:3, 3])
     if settings.patterns:
         surfaces += _patterns(rng, settings, walls, targets, float(T_room_rig[2, 3]))
+    if settings.screened_overlap is not None:
+        surfaces += _screen(T_room_rig, _overlap_azimuths(settings, T_room_rig)[settings.screened_overlap])
     light = np.array([rng.uniform(-0.4, 0.4), rng.uniform(-0.4, 0.4), height - 0.15])
     return Scene(settings.seed, tuple(surfaces), T_room_rig, light, walls)
 
@@ -143,6 +147,15 @@ def _furniture(
                 surfaces += placed
                 break
     return surfaces
+
+
+def _screen(T_room_rig: Pose, azimuth: float) -> list[Surface]:
+    """A plain board on the floor, across a direction from the rig's axis."""
+    c, s = np.cos(azimuth), np.sin(azimuth)
+    T = np.eye(4)
+    T[:2, :2] = [[-s, -c], [c, -s]]  # y points back to the rig
+    T[:2, 3] = T_room_rig[:2, 3] + _SCREEN_OFF_M * np.array([c, s])
+    return Box(0, 0, 0, _SCREEN_M, "paint").surfaces(T)
 
 
 def _overlaps_to_block(

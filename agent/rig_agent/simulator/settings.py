@@ -50,6 +50,8 @@ class SimulatorSettings(Settings):
     """Share of the wall area given to patterns, before furniture hides some of it."""
     blocked_overlaps: int = Field(2, ge=0)
     """Overlaps of neighbours with a tall piece of furniture in front."""
+    screened_overlap: int | None = Field(None, ge=0)
+    """Index of an overlap with a plain screen so near that its two cameras see nothing in common."""
 
     mounting_deg: float = Field(1.0, ge=0)
     """Mounting error, one sigma an axis."""
@@ -87,6 +89,8 @@ class SimulatorSettings(Settings):
         for key, camera in chosen.items():
             if camera is not None and not 0 <= camera < self.cameras:
                 raise ValueError(f"{key} {camera} is not in a ring of {self.cameras} cameras")
+        if self.screened_overlap is not None and self.screened_overlap >= len(self.overlaps):
+            raise ValueError(f"screened_overlap {self.screened_overlap} is not among {len(self.overlaps)}")
         return self
 
     @property

@@ -3,8 +3,11 @@
 import numpy as np
 import pytest
 
+from rig_agent.simulator.ring import VirtualRig
 from rig_agent.simulator.scene import Scene, build_scene
 from rig_agent.simulator.settings import SimulatorSettings
+from rig_protocol.camera import DEFAULT_COLOR
+from rig_protocol.poses import inverse, transform_points
 
 FURNITURE = {"wood", "books", "carton", "fabric"}
 SEEDS = range(12)
@@ -69,6 +72,25 @@ def test_furniture_stands_in_front_of_two_overlaps(seed: int) -> None:
 
 def test_no_overlap_is_blocked_when_none_is_asked_for() -> None:
     assert blocked_overlaps(room(3, blocked_overlaps=0)) == 0
+
+
+def seen_by_both(settings: SimulatorSettings, i: int, j: int) -> int:
+    """Pixels of camera i that show, beyond 0.75 m, what lies in the field of camera j too."""
+    rig, camera = VirtualRig(settings), DEFAULT_COLOR
+    z_m = rig.camera(i).view().color_z_m().astype(np.float64)
+    v, u = np.indices(z_m.shape)
+    points = np.stack([(u - camera.cx) / camera.fx * z_m, (v - camera.cy) / camera.fy * z_m, z_m], axis=-1)
+    x, y, z = np.moveaxis(
+        transform_points(inverse(rig.camera(j).T_rig_camera) @ rig.camera(i).T_rig_camera, points), -1, 0
+    )
+    inside = (z > 0) & (np.abs(x) < 0.58 * z) & (np.abs(y) < 0.43 * z)
+    return int((inside & (z_m > 0.75)).sum())
+
+
+def test_a_screened_overlap_leaves_its_cameras_nothing_in_common() -> None:
+    settings = SimulatorSettings(seed=2, blocked_overlaps=0)
+    assert seen_by_both(settings, 4, 5) > 20_000
+    assert seen_by_both(settings.model_copy(update={"screened_overlap": 4}), 4, 5) == 0
 
 
 @pytest.mark.parametrize("seed", SEEDS)
