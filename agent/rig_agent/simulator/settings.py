@@ -51,6 +51,9 @@ class SimulatorSettings(Settings):
     blocked_overlaps: int = Field(2, ge=0)
     """Overlaps of neighbours with a tall piece of furniture in front."""
 
+    people: int = Field(0, ge=0, le=8)
+    """How many people walk around the rig, all the time."""
+
     mounting_deg: float = Field(1.0, ge=0)
     """Mounting error, one sigma an axis."""
     mounting_m: float = Field(0.005, ge=0)
