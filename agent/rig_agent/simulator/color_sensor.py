@@ -81,7 +81,7 @@ def mosaic(image: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
 
 
 def _noise_sigma(base: Plane) -> Plane:
-    return np.sqrt(_PHOTON_VARIANCE * base + _READ_SIGMA**2, dtype=np.float32)
+    return np.asarray(np.sqrt(_PHOTON_VARIANCE * base + _READ_SIGMA**2), dtype=np.float32)
 
 
 def _through_lens(scene: ImageU8 | Plane, samples: int) -> npt.NDArray[np.float32]:

@@ -35,7 +35,7 @@ _PENUMBRA_PX = 1.0  # of the coarse image
 
 @dataclass(frozen=True, slots=True, eq=False)
 class LampLight:
-    """What a still scene's points (rows, columns, 3), seen on a coarse grid, keep of their light in a shadow."""
+    """Points (rows, columns, 3) of a still scene, and the share of light that each keeps in a shadow."""
 
     points: Vector
     left: Vector
@@ -57,8 +57,8 @@ class LampLight:
         rays = ray_grid(coarse)
         hits = cast(scene.surfaces, T_room_color, rays)
         z = 1 / np.where(hits.surface != NOTHING, hits.inverse_z, 1).astype(np.float64)
-        points = np.stack([rays.x * z, rays.y * z, z], axis=-1).reshape(-1, 3)
-        points = transform_points(T_room_color, points).reshape(*rays.shape, 3)
+        seen = np.stack([rays.x * z, rays.y * z, z], axis=-1)
+        points = transform_points(T_room_color, seen)
         left = left_in_shadow(points, surface_normals(scene.surfaces)[hits.surface], scene.light)
         return cls(points, left, scene.light, (camera.width, camera.height))
 
@@ -122,10 +122,10 @@ def depth_patches(
 
 def _pasted(seen: CleanDepth, patch: DepthPatch) -> CleanDepth:
     """The whole image with a patch in it: people may stand before one another."""
-    planes = [plane.copy() for plane in (seen.z_m, seen.cosine, seen.shadow)]
-    for plane, new in zip(planes, (patch.clean.z_m, patch.clean.cosine, patch.clean.shadow), strict=True):
-        plane[patch.window] = new
-    return CleanDepth(planes[0], planes[1], planes[2], seen.interfered)
+    z_m, cosine, shadow = seen.z_m.copy(), seen.cosine.copy(), seen.shadow.copy()
+    z_m[patch.window], cosine[patch.window] = patch.clean.z_m, patch.clean.cosine
+    shadow[patch.window] = patch.clean.shadow
+    return CleanDepth(z_m, cosine, shadow, seen.interfered)
 
 
 def _distance_m(person: Standing, T_room_camera: Pose) -> float:

@@ -162,7 +162,7 @@ class VirtualKinect:
         return View(self._scene, self.unit, self.T_rig_camera_at(frame))
 
     def frame(self, k: int) -> RgbdFrame:
-        """Frame k, stamped as if frame 0 was taken at `phase_ns`; noise and people repeat after `frames_rendered`."""
+        """Frame k, stamped as if frame 0 was taken at `phase_ns`; all repeats after `frames_rendered`."""
         loop = self._settings.frames_rendered
         images = self._looped(k, k % loop) if loop else self._images(k, k)
         return RgbdFrame(

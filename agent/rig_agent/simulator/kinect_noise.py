@@ -91,9 +91,11 @@ class DisparitySensor:
         return raw
 
     def _measured(self, patch: DepthPatch) -> tuple[Plane, Plane, Mask]:
-        """On the patch's window: disparity without fresh noise, the latter's sigma, where nothing is measured."""
+        """On a window: disparity without fresh noise, the sigma of that, and where nothing is measured."""
         window, clean, settings, model = patch.window, patch.clean, self._settings, self._raw_model
-        z_m = np.clip(_with_ragged_edges(clean.z_m, (self._jitter[0][window], self._jitter[1][window])), 0.1, 50)
+        z_m = np.clip(
+            _with_ragged_edges(clean.z_m, (self._jitter[0][window], self._jitter[1][window])), 0.1, 50
+        )
         ideal = model.offset - model.numerator_m / z_m
         amplitude = distortion_amplitude(settings, model, ideal) * self._distortion_scale
         sigma = noise_sigma_lsb(settings, model, z_m, clean.cosine)
@@ -127,9 +129,7 @@ def smooth_field(rng: np.random.Generator, shape: tuple[int, int]) -> Plane:
     return np.asarray(cv2.resize(field.astype(np.float32), shape[::-1], interpolation=cv2.INTER_CUBIC))
 
 
-def distortion_amplitude(
-    settings: SimulatorSettings, raw_model: RawDepthModel, disparity: Plane
-) -> Plane:
+def distortion_amplitude(settings: SimulatorSettings, raw_model: RawDepthModel, disparity: Plane) -> Plane:
     """Peak to peak of a typical unit's distortion, LSB, at each pixel's disparity."""
 
     def decay(d: Plane | float) -> npt.NDArray[np.floating]:

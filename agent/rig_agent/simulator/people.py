@@ -43,7 +43,8 @@ class Standing:
         """Corners (8,3) of a box in the room that holds the whole person."""
         low = np.min([_low(box) for box in self.boxes], axis=0)
         high = np.max([_low(box) + box.size for box in self.boxes], axis=0)
-        return transform_points(self.T_room_person, np.array(list(product(*zip(low, high, strict=True)))))
+        corners = np.array(list(product(*zip(low, high, strict=True))), dtype=np.float64)
+        return transform_points(self.T_room_person, corners)
 
     def blocks(self, points: Vector, source: Vector) -> Mask:
         """Which points (N,3) of the room get no light from the source (3,), because the person is between.
@@ -103,7 +104,9 @@ class _Walker:
     def at(self, time_s: float) -> Standing:
         period_s = self._times_s[-1]
         rounds, within_s = divmod(time_s, period_s)
-        angle = np.interp(within_s, self._times_s, self._angles) + rounds * (self._angles[-1] - self._angles[0])
+        angle = np.interp(within_s, self._times_s, self._angles) + rounds * (
+            self._angles[-1] - self._angles[0]
+        )
         turn = int(np.searchsorted(self._times_s, within_s, side="right")) - 1
         radius = self._radius(angle)
         T = np.eye(4)
@@ -141,7 +144,8 @@ def _free_floor_m(scene: Scene) -> Vector:
     for number, azimuth in enumerate(np.arange(_AZIMUTHS) * 2 * np.pi / _AZIMUTHS):
         free[number] = _nearest_m(start, np.array([np.cos(azimuth), np.sin(azimuth)]), sides)
     beside = int(np.ceil(np.arcsin(_ELBOW_ROOM_M / KEEP_OUT_M) / (2 * np.pi / _AZIMUTHS)))
-    return np.min([np.roll(free, shift) for shift in range(-beside, beside + 1)], axis=0)
+    turned = [np.roll(free, shift) for shift in range(-beside, beside + 1)]
+    return np.asarray(np.min(turned, axis=0))
 
 
 def _nearest_m(start: Vector, direction: Vector, sides: Vector) -> float:
