@@ -104,7 +104,7 @@ def calibrate(
         method=settings.method,
         rig_frame="ring" if nominal.keys() & solution.poses.keys() else _first_camera(solution.poses),
         cameras=_calibrated_cameras(views, solution),
-        edges=tuple(_calibrated_edge(edge) for edge in solution.edges),
+        edges=tuple(_calibrated_edge(edge, solution.rig) for edge in solution.edges),
         loop_closure=_loop_closure(solution),
         seconds=stages.seconds(),
         frames_used=max((len(view.color) for view in views), default=0),
@@ -112,7 +112,7 @@ def calibrate(
         warnings=tuple(warnings),
         failures=tuple(failures),
     )
-    evidence = tuple(edge_evidence(solution.cameras, solution.edges, solution.poses))
+    evidence = tuple(edge_evidence(solution.cameras, solution.edges, solution.poses, solution.rig))
     return CalibrationResult(calibration, evidence, before, solution.rig)
 
 
@@ -231,6 +231,7 @@ def _judge(
 
 def _calibrated_cameras(views: Sequence[CameraView], solution: _Solution) -> tuple[CalibratedCamera, ...]:
     rig = solution.rig
+    aligned = {} if rig is None else rig.aligned_covariances()
     return tuple(
         CalibratedCamera(
             id=view.camera_id,
@@ -238,13 +239,15 @@ def _calibrated_cameras(views: Sequence[CameraView], solution: _Solution) -> tup
             T_rig_camera=solution.poses[view.camera_id],
             covariance=None if rig is None else rig.covariance_of(view.camera_id),
             depth_correction=None if rig is None else rig.corrections[view.camera_id],
+            aligned_covariance=aligned.get(view.camera_id),
         )
         for view in views
         if view.camera_id in solution.poses
     )
 
 
-def _calibrated_edge(edge: Edge) -> CalibratedEdge:
+def _calibrated_edge(edge: Edge, rig: AdjustedRig | None) -> CalibratedEdge:
+    placed = rig is not None and {edge.i, edge.j} <= rig.poses.keys()
     return CalibratedEdge(
         i=edge.i,
         j=edge.j,
@@ -254,6 +257,7 @@ def _calibrated_edge(edge: Edge) -> CalibratedEdge:
         T_i_j=np.eye(4) if edge.T_i_j is None else edge.T_i_j,
         used=edge.reason is None,
         reason=edge.reason,
+        relative_covariance=rig.relative(edge.i, edge.j)[1] if rig is not None and placed else None,
     )
 
 

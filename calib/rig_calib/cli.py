@@ -1,4 +1,4 @@
-"""The program `rig-calib`: calibrates a rig folder, compares with a truth, fuses, measures intrinsics."""
+"""The program `rig-calib`: calibrates a rig folder, compares, fuses, measures intrinsics, prints, exports."""
 
 import json
 from pathlib import Path
@@ -21,6 +21,10 @@ _EXAMPLES = """
 `rig-calib fuse captures/hall --calibration results/calibration.json --out hall` — fuse another capture
 
 `rig-calib intrinsics board/*.png --board 9x6 --square-mm 25 --out unit.json` — measure one colour camera
+
+`rig-calib pattern --out patterns` — sheets to print and to hang where neighbours' views overlap
+
+`rig-calib export results/calibration.json --format ros2 --out rig.launch.py` — for other programs
 """
 
 app = typer.Typer(
@@ -141,6 +145,86 @@ def intrinsics(
         f"fx {color.fx:.2f} fy {color.fy:.2f} cx {color.cx:.2f} cy {color.cy:.2f} px, "
         f"rms {estimate.color.rms_px:.3f} px, written to {out}"
     )
+
+
+@app.command()
+def pattern(
+    out: Annotated[Path, typer.Option(help="Folder for patterns.pdf and patterns.json.")] = Path("patterns"),
+    paper: Annotated[str, typer.Option(metavar="A4|A3|A2|A1|A0", help="Paper to print on.")] = "A3",
+    patterns: Annotated[
+        int | None,
+        typer.Option(min=1, help="Different patterns; default: 4 (A4), 3 (A3), 2 or 1 (larger) an overlap."),
+    ] = None,
+    cameras: Annotated[int, typer.Option(min=2, max=64, help="Cameras of the ring.")] = 12,
+    seed: Annotated[
+        int, typer.Option(min=0, max=2**31 - 1, help="Another seed makes another set: never hang one twice.")
+    ] = 1,
+    tiles: Annotated[
+        str | None, typer.Option(metavar="CxR", help="Sheets of one pattern across and down, as 3x4.")
+    ] = None,
+    size_m: Annotated[
+        str | None, typer.Option(metavar="WxH", help="Or the size of one pattern in metres, as 0.9x1.2.")
+    ] = None,
+) -> None:
+    """Make calibration patterns to print: a set for a room of twelve cameras by default, 36 sheets of A3."""
+    from rich.console import Console
+
+    from rig_calib.outputs import make_output_folder
+    from rig_calib.pattern_layout import plan_patterns
+    from rig_calib.pattern_sheets import write_pattern_set
+    from rig_calib.terminal import progress_bar
+
+    plan = plan_patterns(paper, seed, cameras, patterns, tiles, size_m)
+    make_output_folder(out)
+    console = Console(highlight=False)
+    with progress_bar(console) as tell:
+        sheets, record = write_pattern_set(out, plan, lambda share: tell("patterns", share))
+    megabytes = sheets.stat().st_size / 1e6
+    console.print(f"{plan.summary}: {sheets} ({megabytes:.1f} MB), {record}", soft_wrap=True, markup=False)
+    console.print(
+        "Next: print at 100 % on matt paper, measure the scale bar (100 mm), hang the sheets where "
+        "neighbours' views overlap (page 1 shows how), then `rig-server --calibrate`.",
+        soft_wrap=True,
+    )
+
+
+@app.command()
+def export(
+    calibration: Annotated[Path, typer.Argument(help="A calibration.json.")],
+    form: Annotated[
+        str, typer.Option("--format", metavar="kalibr|ros2|urdf|colmap|nerfstudio|opencv", help="For whom.")
+    ],
+    out: Annotated[Path, typer.Option(help="File to write, or a folder; for colmap always a folder.")],
+    rig: Annotated[
+        Path | None,
+        typer.Option(
+            help="Where intrinsics stand: the rig folder (with its images), nominal.json or rig.toml."
+        ),
+    ] = None,
+    frames: Annotated[
+        int,
+        typer.Option(min=1, max=10_000, help="Panoramic frames of the folder to list: its rig was at rest."),
+    ] = 1,
+) -> None:
+    """Write a calibration for another program; docs/exports.md says which axes and how to load it."""
+    from rich.console import Console
+
+    from rig_calib.exports.exported_rig import exported_rig
+    from rig_calib.exports.formats import find_format, target_folder, write_export
+    from rig_calib.exports.known_rig import KnownRig, read_known_rig
+
+    chosen, result = find_format(form), _load(calibration)
+    known = KnownRig() if rig is None else read_known_rig(rig, frames)
+    exported = exported_rig(
+        result, known.models, known.images, known.image_root_from(target_folder(chosen, out))
+    )
+    made = chosen.export(exported)
+    console = Console(highlight=False, soft_wrap=True)
+    for path in write_export(chosen, made, out):
+        console.print(str(path), markup=False)
+    failed = [f"this calibration did not pass its gate: {why}" for why in result.failures]
+    for note in [*failed, *known.left_out(result.poses), *made.notes]:
+        console.print(note, style="yellow", markup=False)
 
 
 def main() -> None:

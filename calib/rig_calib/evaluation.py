@@ -1,14 +1,15 @@
 """Errors of a calibration against known true poses."""
 
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from itertools import combinations, pairwise
 from typing import Any
 
 import numpy as np
 
 from rig_calib.alignment import align_frames
-from rig_calib.rig_calibration import RigCalibration
+from rig_calib.normalised_error import Consistency, normalised_error
+from rig_calib.rig_calibration import CalibratedEdge, RigCalibration
 from rig_protocol.errors import DataError
 from rig_protocol.poses import Pose, inverse, rotation_angle_deg
 
@@ -63,7 +64,8 @@ class Evaluation:
     """Errors of relative poses by pair, and of every camera after aligning the rigs as wholes.
 
     `neighbours` are cameras of consecutive ids, in a closed ring the last and the first too; `used` the pairs
-    whose edges the calibration used; `missing` the cameras of the truth that have no estimate.
+    whose edges the calibration used; `missing` the cameras of the truth that have no estimate. `pair_nees`
+    and `camera_nees` are `normalised_error`s, where the calibration states the covariance.
     """
 
     pairs: Mapping[Pair, PoseError]
@@ -72,6 +74,8 @@ class Evaluation:
     near: tuple[Pair, ...]
     cameras: Mapping[int, PoseError]
     missing: tuple[int, ...]
+    pair_nees: Mapping[Pair, float] = field(default_factory=dict)
+    camera_nees: Mapping[int, float] = field(default_factory=dict)
 
     def over(self, pairs: Iterable[Pair]) -> ErrorSummary | None:
         """Summary over some of the pairs."""
@@ -92,20 +96,41 @@ class Evaluation:
         }
         return {name: summary for name, summary in found.items() if summary is not None}
 
+    def consistency(self) -> dict[str, Consistency]:
+        """Of `pairs` (neighbours and used edges) and of aligned `cameras`, where covariances are known."""
+        found = {
+            "pairs": Consistency.of(
+                nees for pair, nees in self.pair_nees.items() if pair in self.used or pair in self.neighbours
+            ),
+            "cameras": Consistency.of(self.camera_nees.values()),
+        }
+        return {name: consistency for name, consistency in found.items() if consistency is not None}
+
     def to_dict(self) -> dict[str, Any]:
         """What `rig-calib evaluate --json` prints."""
         edges = [
-            {"i": i, "j": j, "deg": error.deg, "mm": error.mm, "used": (i, j) in self.used}
-            for (i, j), error in self.pairs.items()
-            if (i, j) in self.used or (i, j) in self.neighbours
+            {
+                "i": pair[0],
+                "j": pair[1],
+                "deg": error.deg,
+                "mm": error.mm,
+                "used": pair in self.used,
+                "nees": self.pair_nees.get(pair),
+            }
+            for pair, error in self.pairs.items()
+            if pair in self.used or pair in self.neighbours
         ]
-        cameras = [{"id": c, "deg": error.deg, "mm": error.mm} for c, error in self.cameras.items()]
+        cameras = [
+            {"id": c, "deg": error.deg, "mm": error.mm, "nees": self.camera_nees.get(c)}
+            for c, error in self.cameras.items()
+        ]
         summaries = {name: summary.to_dict() for name, summary in self.summaries().items()}
         return {
             **summaries,
             "near_limit_deg": NEAR_LIMIT_DEG,
             "edges": edges,
             "cameras": cameras,
+            "consistency": {name: value.to_dict() for name, value in self.consistency().items()},
             "missing": list(self.missing),
         }
 
@@ -113,8 +138,9 @@ class Evaluation:
 def evaluate(estimated: RigCalibration | Mapping[int, Pose], truth: Mapping[int, Pose]) -> Evaluation:
     """Compare a calibration, or T_rig_camera by id, with true poses; DataError without a common camera."""
     used: set[Pair] = set()
+    calibration = estimated if isinstance(estimated, RigCalibration) else None
     if isinstance(estimated, RigCalibration):
-        used = {(min(e.i, e.j), max(e.i, e.j)) for e in estimated.edges if e.used}
+        used = {_pair(edge) for edge in estimated.edges if edge.used}
         estimated = estimated.poses
     common = sorted(estimated.keys() & truth.keys())
     if not common:
@@ -131,7 +157,40 @@ def evaluate(estimated: RigCalibration | Mapping[int, Pose], truth: Mapping[int,
         near=tuple(pair for pair, T in true.items() if rotation_angle_deg(T) < NEAR_LIMIT_DEG),
         cameras={c: PoseError.between(T_truth_estimated @ estimated[c], truth[c]) for c in common},
         missing=tuple(sorted(truth.keys() - estimated.keys())),
+        pair_nees={} if calibration is None else _pair_nees(calibration, truth),
+        camera_nees={} if calibration is None else _camera_nees(calibration, truth, T_truth_estimated),
     )
+
+
+def _pair(edge: CalibratedEdge) -> Pair:
+    return min(edge.i, edge.j), max(edge.i, edge.j)
+
+
+def _pair_nees(calibration: RigCalibration, truth: Mapping[int, Pose]) -> dict[Pair, float]:
+    """Of the adjusted relative pose of every edge whose cameras have a pose and a truth."""
+    poses, found = calibration.poses, {}
+    for edge in calibration.edges:
+        if {edge.i, edge.j} <= poses.keys() & truth.keys():
+            estimated, true = (inverse(T[edge.i]) @ T[edge.j] for T in (poses, truth))
+            nees = normalised_error(estimated, true, edge.relative_covariance)
+            if nees is not None:
+                found[_pair(edge)] = nees
+    return found
+
+
+def _camera_nees(
+    calibration: RigCalibration, truth: Mapping[int, Pose], T_truth_estimated: Pose
+) -> dict[int, float]:
+    """Of every aligned camera; nothing when the truth lacks one, for the alignment is over them all."""
+    if not calibration.poses.keys() <= truth.keys():
+        return {}
+    found = {
+        camera.id: normalised_error(
+            T_truth_estimated @ camera.T_rig_camera, truth[camera.id], camera.aligned_covariance
+        )
+        for camera in calibration.cameras
+    }
+    return {camera_id: nees for camera_id, nees in found.items() if nees is not None}
 
 
 def _neighbours(ids: list[int], true: Mapping[Pair, Pose]) -> tuple[Pair, ...]:

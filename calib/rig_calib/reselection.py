@@ -13,6 +13,8 @@ from rig_calib.keypoint_depth import keypoint_points
 from rig_calib.observed_camera import ObservedCamera
 from rig_calib.projection import from_pixels, project
 from rig_calib.registration import Side, Tolerance, agreeing
+from rig_calib.rig_adjustment import AdjustedRig
+from rig_calib.standardised import StandardisedResiduals
 from rig_protocol.poses import Pose, inverse, transform_points
 
 Array = npt.NDArray[np.float64]
@@ -46,10 +48,14 @@ def reselect(
 
 
 def edge_evidence(
-    cameras: Mapping[int, ObservedCamera], edges: Sequence[Edge], poses: Mapping[int, Pose]
+    cameras: Mapping[int, ObservedCamera],
+    edges: Sequence[Edge],
+    poses: Mapping[int, Pose],
+    rig: AdjustedRig | None = None,
 ) -> list[EdgeEvidence]:
     """What the report draws of every edge with matches; residuals where both cameras have a pose."""
-    return [_evidence(cameras, edge, poses) for edge in edges if len(edge.matches)]
+    residuals = None if rig is None else StandardisedResiduals.of(rig)
+    return [_evidence(cameras, edge, poses, residuals) for edge in edges if len(edge.matches)]
 
 
 def _reselected(
@@ -66,13 +72,22 @@ def _reselected(
     return replace(edge, inlier=inlier)
 
 
-def _evidence(cameras: Mapping[int, ObservedCamera], edge: Edge, poses: Mapping[int, Pose]) -> EdgeEvidence:
+def _evidence(
+    cameras: Mapping[int, ObservedCamera],
+    edge: Edge,
+    poses: Mapping[int, Pose],
+    residuals: StandardisedResiduals | None,
+) -> EdgeEvidence:
     i, j = _sides(cameras, edge)
     residual = np.full(len(edge.matches), np.nan)
     if edge.i in poses and edge.j in poses:
         T_i_j = inverse(poses[edge.i]) @ poses[edge.j]
         residual = np.fmax(_miss_px(T_i_j, j, i), _miss_px(inverse(T_i_j), i, j))
-    return EdgeEvidence(edge.i, edge.j, i.pixels, j.pixels, edge.inlier, residual)
+    evidence = EdgeEvidence(edge.i, edge.j, i.pixels, j.pixels, edge.inlier, residual)
+    if residuals is None or edge.reason is not None:
+        return evidence
+    pixel, disparity = residuals.of_pair(*edge.pair)
+    return replace(evidence, pixel_errors=pixel, disparity_errors=disparity)
 
 
 def _miss_px(T: Pose, source: Side, target: Side) -> Array:

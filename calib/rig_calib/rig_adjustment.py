@@ -48,6 +48,12 @@ class AdjustedRig:
         """Covariance (6,6) of one camera's pose in the adjustment's frame."""
         return self.covariance.of(self.scene.cameras.index(camera_id))
 
+    def aligned_covariances(self) -> dict[int, Array]:
+        """Covariance (6,6) of every camera's pose without the common turn and shift of the rig, by id."""
+        order = self.scene.cameras
+        aligned = self.covariance.aligned([self.poses[c] for c in order])
+        return {camera_id: aligned.of(k) for k, camera_id in enumerate(order)}
+
     def observed_noise(self) -> NoiseModel:
         """How noisy the capture turned out to be."""
         return observed_noise(self.scene.observations, self.adjustment.residuals, len(self.scene.points))

@@ -21,7 +21,10 @@ SCHEMA = 1
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CalibratedCamera:
-    """Pose of one colour camera: T_true = T_rig_camera · Exp(δ), δ ~ N(0, covariance), rotation first."""
+    """Pose of one colour camera: T_true = T_rig_camera · Exp(δ), δ ~ N(0, covariance), rotation first.
+
+    `aligned_covariance` is that of δ without the common turn and shift of the whole rig against its frame.
+    """
 
     id: int
     name: str
@@ -29,6 +32,7 @@ class CalibratedCamera:
     covariance: npt.NDArray[np.float64] | None = None
     depth_correction: DepthCorrection | None = None
     serial: str | None = None
+    aligned_covariance: npt.NDArray[np.float64] | None = None
 
     def to_dict(self) -> dict[str, Any]:
         """One item of `cameras`."""
@@ -37,27 +41,32 @@ class CalibratedCamera:
             "name": self.name,
             "serial": self.serial,
             "T_rig_camera": self.T_rig_camera.tolist(),
-            "covariance": None if self.covariance is None else self.covariance.tolist(),
+            "covariance": _listed(self.covariance),
+            "aligned_covariance": _listed(self.aligned_covariance),
             "depth_correction": None if self.depth_correction is None else self.depth_correction.to_dict(),
         }
 
     @classmethod
     def from_dict(cls, values: Mapping[str, Any]) -> "CalibratedCamera":
         """Read one item of `cameras`."""
-        covariance, correction = values.get("covariance"), values.get("depth_correction")
+        correction = values.get("depth_correction")
         return cls(
             id=int(values["id"]),
             name=str(values["name"]),
             T_rig_camera=as_pose(values["T_rig_camera"], "T_rig_camera"),
-            covariance=None if covariance is None else np.array(covariance, dtype=np.float64).reshape(6, 6),
+            covariance=_as_covariance(values.get("covariance")),
             depth_correction=None if correction is None else DepthCorrection.from_dict(correction),
             serial=values.get("serial"),
+            aligned_covariance=_as_covariance(values.get("aligned_covariance")),
         )
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CalibratedEdge:
-    """One pair of cameras with a common view; `T_i_j` is what this edge alone measured."""
+    """One pair of cameras with a common view; `T_i_j` is what this edge alone measured.
+
+    `relative_covariance` (6,6) is of the calibration's own inverse(T_rig_i) · T_rig_j, on its right.
+    """
 
     i: int
     j: int
@@ -67,6 +76,7 @@ class CalibratedEdge:
     T_i_j: Pose
     used: bool
     reason: str | None = None
+    relative_covariance: npt.NDArray[np.float64] | None = None
 
     def to_dict(self) -> dict[str, Any]:
         """One item of `edges`."""
@@ -79,6 +89,7 @@ class CalibratedEdge:
             "T_i_j": self.T_i_j.tolist(),
             "used": self.used,
             "reason": self.reason,
+            "relative_covariance": _listed(self.relative_covariance),
         }
 
     @classmethod
@@ -93,6 +104,7 @@ class CalibratedEdge:
             as_pose(values["T_i_j"], "T_i_j"),
             bool(values["used"]),
             values.get("reason"),
+            _as_covariance(values.get("relative_covariance")),
         )
 
 
@@ -204,3 +216,17 @@ class RigCalibration:
             return cls.from_dict(read_json(path))
         except DataError as error:
             raise DataError(f"{path}: {error}") from error
+
+
+def _listed(covariance: npt.NDArray[np.float64] | None) -> list[list[float]] | None:
+    return None if covariance is None else covariance.tolist()
+
+
+def _as_covariance(values: Any) -> npt.NDArray[np.float64] | None:
+    """A covariance (6,6) from its list, None of None; ValueError when it cannot be one."""
+    if values is None:
+        return None
+    covariance = np.array(values, dtype=np.float64).reshape(6, 6)
+    if not np.isfinite(covariance).all() or not np.allclose(covariance, covariance.T):
+        raise ValueError("a covariance is a finite, symmetric 6x6 matrix")
+    return covariance

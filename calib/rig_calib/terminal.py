@@ -80,8 +80,19 @@ def evaluation_table(evaluation: Evaluation) -> RenderableType:
         if figures not in shown:  # in a full ring neighbours, used edges and near pairs are the same
             shown.append(figures)
             table.add_row(_SUMMARY_NAMES.get(name, name), str(summary.count), *figures)
-    missing = ", ".join(map(str, evaluation.missing))
-    return Group(table, Text(f"without an estimate: cameras {missing}")) if missing else table
+    lines: list[RenderableType] = [table, *_consistency(evaluation)]
+    if evaluation.missing:
+        lines.append(Text(f"without an estimate: cameras {', '.join(map(str, evaluation.missing))}"))
+    return Group(*lines)
+
+
+def _consistency(evaluation: Evaluation) -> list[RenderableType]:
+    """Whether the errors are as large as the calibration's covariances say."""
+    told = [
+        f"{known.nees:.2f} over {known.count} {name} ({known.low:.2f}–{known.high:.2f} expected)"
+        for name, known in evaluation.consistency().items()
+    ]
+    return [Text(f"consistency: mean NEES per dof {', '.join(told)}")] if told else []
 
 
 def _edges(rows: Sequence[Mapping[str, str]]) -> list[RenderableType]:

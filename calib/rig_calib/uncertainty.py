@@ -8,7 +8,7 @@ import numpy.typing as npt
 
 from rig_calib.bundle_adjustment import AdjustedCamera, Adjustment
 from rig_calib.observation_model import POSE
-from rig_protocol.poses import Pose, adjoint, inverse
+from rig_protocol.poses import Pose, adjoint, hat, inverse
 
 Array = npt.NDArray[np.float64]
 
@@ -33,6 +33,17 @@ class PoseCovariance:
         ii, ij, jj = self.blocks[i, :, i], self.blocks[i, :, j], self.blocks[j, :, j]
         return np.asarray(jj - Ad @ ij - ij.T @ Ad.T + Ad @ ii @ Ad.T)
 
+    def aligned(self, poses: Sequence[Pose]) -> "PoseCovariance":
+        """Joint covariance without the common turn and shift of the rig, which no relative pose depends on.
+
+        `poses` are the C cameras' T_rig_camera. It is what is left of the errors once `align_frames` has laid
+        the rig on the truth, and the same whatever the frame of the adjustment is.
+        """
+        count = len(poses)
+        left = _alignment_residual(poses)
+        whole = left @ self.blocks.reshape(6 * count, 6 * count) @ left.T
+        return PoseCovariance((0.5 * (whole + whole.T)).reshape(count, 6, count, 6))
+
 
 def pose_covariance(adjustment: Adjustment, cameras: Sequence[AdjustedCamera]) -> PoseCovariance:
     """Covariance of all poses with every other state marginalised.
@@ -49,6 +60,23 @@ def pose_covariance(adjustment: Adjustment, cameras: Sequence[AdjustedCamera]) -
     full = np.zeros((count * size, count * size))
     full[np.ix_(rows, rows)] = 0.5 * (covariance + covariance.T)
     return PoseCovariance(full.reshape(count, size, count, size)[:, POSE, :, POSE])
+
+
+def _alignment_residual(poses: Sequence[Pose]) -> Array:
+    """The matrix (6C,6C) that takes the poses' δ to what `align_frames` leaves of them, to first order."""
+    count = len(poses)
+    to_rig = np.zeros((count, 6, count, 6))  # (turn, shift) of every camera on the axes of the rig
+    for c, T in enumerate(poses):
+        to_rig[c, :3, c, :3] = to_rig[c, 3:, c, 3:] = T[:3, :3]
+    turn = to_rig[:, :3].mean(axis=0)  # of the rig: the mean of its cameras'
+    carried = np.array([-hat(T[:3, 3]) for T in poses]) @ turn.reshape(3, -1)  # what that turn does to places
+    shift = (to_rig[:, 3:].reshape(count, 3, -1) - carried).mean(axis=0)
+    left = to_rig.reshape(count, 6, -1).copy()
+    left[:, :3] -= turn.reshape(3, -1)
+    left[:, 3:] -= carried + shift
+    for c, T in enumerate(poses):
+        left[c] = np.concatenate([T[:3, :3].T @ left[c, :3], T[:3, :3].T @ left[c, 3:]])
+    return left.reshape(6 * count, 6 * count)
 
 
 def weakest_direction(covariance: Array) -> tuple[float, float]:

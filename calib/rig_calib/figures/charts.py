@@ -1,6 +1,6 @@
 """Charts as inline SVG: they scale, need no scripts and take their colours from the page's CSS.
 
-Classes that the page styles: `good`, `bad`, `ink`, `faint`, `fill-good`, `fill-bad`, `label`.
+Classes that the page styles: `ink`, `faint`, `curve`, `fill-good`, `fill-bad`, `fill-step-0` … `-3`, `label`.
 """
 
 from collections.abc import Mapping, Sequence
@@ -20,9 +20,9 @@ def svg(width: float, height: float, description: str, parts: Sequence[str]) -> 
     )
 
 
-def text(x: float, y: float, content: str, anchor: str = "start") -> str:
-    """A label; `anchor` is start, middle or end."""
-    return f'<text class="label" x="{x:.1f}" y="{y:.1f}" text-anchor="{anchor}">{escape(content)}</text>'
+def text(x: float, y: float, content: str, anchor: str = "start", css: str = "label") -> str:
+    """A label of a CSS class; `anchor` is start, middle or end."""
+    return f'<text class="{css}" x="{x:.1f}" y="{y:.1f}" text-anchor="{anchor}">{escape(content)}</text>'
 
 
 def line(x1: float, y1: float, x2: float, y2: float, css: str) -> str:
@@ -79,6 +79,88 @@ def histogram(
     parts.append(text(left - 6, base, "0", "end"))
     median = f", median {np.median(good):.2f} {unit}" if len(good) else ""
     return svg(width, height, f"{title}: {len(good)} kept{median}; {len(bad)} rejected", parts)
+
+
+def normal_histogram(values: Array, title: str, width: int = 300, height: int = 150) -> str:
+    """Standardised values (N,) against the standard normal curve, with their robust spread in the title."""
+    limit, left, right, base, head = 4.0, 8, 8, height - 20, 20
+    bins = np.linspace(-limit, limit, 41)
+    counts = np.histogram(np.clip(values, -limit, limit), bins)[0]
+    expected = len(values) * (bins[1] - bins[0]) * np.exp(-0.5 * bins**2) / np.sqrt(2 * np.pi)
+    scale = (base - head) / max(float(counts.max()), float(expected.max()), 1.0)
+    step = (width - left - right) / (len(bins) - 1)
+    parts = [text(left, 13, title), text(width - right, 13, f"spread {robust_spread(values):.2f}", "end")]
+    parts += [
+        rectangle(left + k * step + 0.5, base - count * scale, step - 1, count * scale, "fill-good")
+        for k, count in enumerate(counts)
+    ]
+    points = " ".join(f"{left + k * step:.1f},{base - e * scale:.1f}" for k, e in enumerate(expected))
+    parts.append(f'<polyline class="curve" points="{points}"/>')
+    parts.append(line(left, base, width - right, base, "ink"))
+    for value in (-4, -2, 0, 2, 4):
+        x = left + (value + limit) / (2 * limit) * (width - left - right)
+        parts.append(text(x, base + 15, f"{value:d}".replace("-", "−"), _anchor(value, limit)))
+    return svg(width, height, f"{title}: {len(values)} values, spread {robust_spread(values):.2f}", parts)
+
+
+def robust_spread(values: Array) -> float:
+    """Standard deviation (0 of nothing) that the median absolute value gives; outliers hardly change it."""
+    return 1.4826 * float(np.median(np.abs(values))) if len(values) else 0.0
+
+
+def grouped_bars(
+    groups: Mapping[tuple[str, str], Sequence[float]],
+    series: Sequence[str],
+    unit: str,
+    description: str,
+    highlight: tuple[str, str] | None = None,
+) -> str:
+    """A group of bars for each label (two lines), one bar a series, the top of the last one in numbers."""
+    left, head, chart, foot = 44.0, 30.0, 190.0, 40.0
+    bar = 13.0 if len(groups) <= 16 else 7.0
+    step = bar * len(series) + 18.0
+    width, base = left + step * len(groups), head + chart
+    top = nice_ceiling(max([max(values) for values in groups.values()], default=1.0))
+    parts = [text(left - 6, 14, unit, "end")]
+    for share in (0.0, 0.5, 1.0):
+        y = base - share * chart
+        parts.append(line(left, y, width, y, "faint" if share else "ink"))
+        parts.append(text(left - 6, y + 4, f"{share * top:g}", "end"))
+    for k, (labels, values) in enumerate(groups.items()):
+        heights = [min(value / top, 1.0) * chart for value in values]
+        css = "label worst" if labels == highlight else "label"
+        parts += _bar_group(left + k * step + 9, base, bar, heights, labels, css)
+        last = left + (k + 1) * step - 9 - bar / 2
+        parts.append(text(last, base - heights[-1] - 5, f"{values[-1]:.1f}", "middle", css))
+    for k, name in enumerate(series):
+        x = left + 9 + 58 * k
+        parts += [rectangle(x, 4, 11, 11, f"fill-step-{k}"), text(x + 16, 14, name)]
+    return svg(width, base + foot, description, parts)
+
+
+def _bar_group(
+    x: float, base: float, bar: float, heights: Sequence[float], labels: Sequence[str], css: str
+) -> list[str]:
+    """Bars that stand side by side on `base`, their labels line by line below."""
+    parts = [
+        rectangle(x + k * bar, base - height, bar - 1.5, height, f"fill-step-{k}")
+        for k, height in enumerate(heights)
+    ]
+    middle = x + bar * len(heights) / 2
+    rows = enumerate(labels)
+    return parts + [text(middle, base + 16 + 14 * row, label, "middle", css) for row, label in rows]
+
+
+def nice_ceiling(value: float) -> float:
+    """The least of 1, 2, 3, 5, 8 times a power of ten that is not below a value."""
+    if not 0 < value < np.inf:
+        return 1.0
+    decade = 10.0 ** np.floor(np.log10(value))
+    return float(next((m * decade for m in (1, 2, 3, 5, 8) if m * decade >= value), 10.0 * decade))
+
+
+def _anchor(value: float, limit: float) -> str:
+    return "start" if value == -limit else "end" if value == limit else "middle"
 
 
 def horizontal_bars(values: Mapping[str, float], unit: str, description: str, width: int = 560) -> str:

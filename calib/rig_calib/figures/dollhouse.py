@@ -25,23 +25,35 @@ def share_facing(cloud: PointCloud, T_rig_view: Pose, azimuth_deg: float) -> flo
     return float(np.mean(points @ _spectator_direction(azimuth_deg) < 0)) if len(points) else 0.0
 
 
-def dollhouse_picture(cloud: PointCloud, T_rig_view: Pose, azimuth_deg: float = BACK_AZIMUTH_DEG) -> ImageU8:
+def dollhouse_picture(
+    cloud: PointCloud,
+    T_rig_view: Pose,
+    azimuth_deg: float = BACK_AZIMUTH_DEG,
+    framed_by: PointCloud | None = None,
+) -> ImageU8:
     """The cloud (H,W,3), BGR, in perspective from an azimuth of the view frame.
 
-    Every point faces the rig that saw it: those that turn their back on the spectator are left out.
+    Every point faces the rig that saw it: those that turn their back on the spectator are left out. Pictures
+    `framed_by` one cloud (default: their own) have the same spectator and scale.
     """
-    points = transform_points(inverse(T_rig_view), cloud.points_m.astype(np.float64))
-    colors = cloud.colors[:, ::-1]
     towards = _spectator_direction(azimuth_deg)
-    facing = points @ towards < 0
-    points, colors = points[facing], colors[facing]
     image = np.full((_HEIGHT_PX, _WIDTH_PX, 3), _BACKGROUND, np.uint8)
-    if not len(points):
+    points, colors = _facing(cloud, T_rig_view, towards)
+    frame = points if framed_by is None else _facing(framed_by, T_rig_view, towards)[0]
+    if not len(points) or not len(frame):
         return image
-    across, up, depth = _perspective(points, towards)
-    scale, left, top = _fit(across, up)
+    radius = float(np.percentile(np.linalg.norm(frame, axis=1), 98))
+    scale, left, top = _fit(*_perspective(frame, towards, radius)[:2])
+    across, up, depth = _perspective(points, towards, radius)
     _splat(image, across * scale + left, top - up * scale, depth, colors)
     return image
+
+
+def _facing(cloud: PointCloud, T_rig_view: Pose, towards: Array) -> tuple[Array, ImageU8]:
+    """Points (N,3) in the view frame and colours (N,3) BGR of what the spectator sees."""
+    points = transform_points(inverse(T_rig_view), cloud.points_m.astype(np.float64))
+    facing = points @ towards < 0
+    return points[facing], cloud.colors[facing][:, ::-1]
 
 
 def _spectator_direction(azimuth_deg: float) -> Array:
@@ -50,9 +62,8 @@ def _spectator_direction(azimuth_deg: float) -> Array:
     return np.array([np.cos(azimuth) * across, np.sin(azimuth) * across, np.sin(elevation)])
 
 
-def _perspective(points: Array, towards: Array) -> tuple[Array, Array, Array]:
+def _perspective(points: Array, towards: Array, radius: float) -> tuple[Array, Array, Array]:
     """Image coordinates across and up, and the distance from the spectator, (N,) each."""
-    radius = float(np.percentile(np.linalg.norm(points, axis=1), 98))
     right = np.cross([0.0, 0.0, 1.0], towards)
     right /= np.linalg.norm(right)
     depth = _DISTANCE_RADII * radius - points @ towards

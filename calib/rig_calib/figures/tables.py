@@ -6,15 +6,25 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
+from rig_calib.displacement import (
+    ROOM_DISTANCE_M,
+    PairUncertainty,
+    least_certain,
+    pair_uncertainties,
+    worst_pair,
+)
 from rig_calib.evidence import EdgeEvidence
-from rig_calib.fusion.viewpoint import Viewpoint
-from rig_calib.rig_calibration import CalibratedCamera, RigCalibration
+from rig_calib.figures.case import Stage
+from rig_calib.fusion.viewpoint import Viewpoint, rig_viewpoint
+from rig_calib.rig_calibration import CalibratedCamera, CalibratedEdge, RigCalibration
+from rig_calib.uncertainty import weakest_direction
 from rig_calib.view import CameraView
 from rig_protocol.poses import Pose, inverse, rotation_angle_deg
 
 Array = npt.NDArray[np.float64]
 
 UNKNOWN = "–"
+DISTANCES_M = (1.0, 2.0, 3.0, 4.0)
 
 
 @dataclass(frozen=True, slots=True)
@@ -24,14 +34,17 @@ class Sigma:
     deg: float
     mm: float
 
+    def __str__(self) -> str:
+        """As `0.08° / 2.5 mm`."""
+        return f"{self.deg:.2f}° / {self.mm:.1f} mm"
 
-def worst_sigma(camera: CalibratedCamera) -> Sigma | None:
-    """The camera's; None when it has no covariance or defines the frame."""
-    if camera.covariance is None or not camera.covariance.any():
+
+def worst_sigma(covariance: Array | None) -> Sigma | None:
+    """Of a pose's covariance (6,6); None when there is none, or when the pose defines the frame."""
+    if covariance is None or not covariance.any():
         return None
-    variances = [float(np.linalg.eigvalsh(camera.covariance[k : k + 3, k : k + 3])[-1]) for k in (0, 3)]
-    deg, m = np.sqrt(np.maximum(variances, 0.0))
-    return Sigma(float(np.rad2deg(deg)), float(m * 1e3))
+    deg, m = weakest_direction(covariance)
+    return Sigma(deg, m * 1e3)
 
 
 def verdict(calibration: RigCalibration, expected: int) -> str:
@@ -42,13 +55,23 @@ def verdict(calibration: RigCalibration, expected: int) -> str:
         problems = "one problem" if count == 1 else f"{count} problems"
         return f"The calibration did not pass: {problems} to solve, {placed} of {expected} cameras placed."
     everyone = f"all {placed} cameras" if placed == expected else f"{placed} of {expected} cameras"
-    sigmas = {camera.name: sigma for camera in calibration.cameras if (sigma := worst_sigma(camera))}
-    if not sigmas:
-        return f"The calibration passed: {everyone} are placed."
-    name, sigma = max(sigmas.items(), key=lambda item: item[1].mm)
+    return f"The calibration passed: {everyone} are placed. {_certainty(calibration)}"
+
+
+def _certainty(calibration: RigCalibration) -> str:
+    """How well neighbours are known against each other: the worst pair, in words and millimetres."""
+    pairs: list[PairUncertainty] = []
+    if calibration.cameras:
+        T_rig_view = rig_viewpoint(calibration.poses, calibration.rig_frame).T_rig_view
+        pairs = pair_uncertainties(calibration, T_rig_view)
+    worst = worst_pair(pairs, ROOM_DISTANCE_M)
+    if worst is None:
+        return f"It states no uncertainty of relative poses (method {calibration.method})."
+    names = {camera.id: camera.name for camera in calibration.cameras}
+    motion, mm = worst.weakest_motion(ROOM_DISTANCE_M), worst.displacement_mm(ROOM_DISTANCE_M)
     return (
-        f"The calibration passed: {everyone} are placed, and the least certain one, {name}, "
-        f"is known to {sigma.deg:.2f}° and {sigma.mm:.1f} mm (one standard deviation)."
+        f"Least certain: {names[worst.j]} against {names[worst.i]}, {motion}; "
+        f"points at {ROOM_DISTANCE_M:g} m are displaced by {mm:.1f} mm (one standard deviation)."
     )
 
 
@@ -98,11 +121,46 @@ def edge_rows(
                 "inliers": str(edge.inliers),
                 "rms_mm": f"{edge.rms_mm:.1f}" if edge.inliers else UNKNOWN,
                 "median_px": f"{np.median(residuals):.2f}" if len(residuals) else UNKNOWN,
+                "sigma": str(worst_sigma(edge.relative_covariance) or UNKNOWN),
+                "moved": _moved(edge, calibration.poses),
                 "used": "yes" if edge.used else "",
                 "reason": edge.reason or "",
             }
         )
     return rows
+
+
+def _moved(edge: CalibratedEdge, poses: Mapping[int, Pose]) -> str:
+    """How far the adjusted relative pose is from what the edge alone measured."""
+    if not edge.used or not {edge.i, edge.j} <= poses.keys():
+        return UNKNOWN
+    return _difference(inverse(poses[edge.i]) @ poses[edge.j], edge.T_i_j)
+
+
+def displacement_rows(
+    calibration: RigCalibration, pairs: Sequence[PairUncertainty], stages: Sequence[Stage]
+) -> list[dict[str, str]]:
+    """A row for every overlap around the rig: millimetres at each distance, and what causes most of them."""
+    names = {camera.id: camera.name for camera in calibration.cameras}
+    worst = least_certain(pairs)
+    return [
+        {
+            "pair": f"{names[pair.i]} – {names[pair.j]}",
+            "worst": "yes" if pair is worst else "",
+            "sigma": str(Sigma(*pair.sigma)),
+            **{f"at_{d:g}": f"{pair.displacement_mm(d):.1f}" for d in DISTANCES_M},
+            "weakest": str(pair.weakest_motion(ROOM_DISTANCE_M)),
+            "differ": _differ(pair, stages),
+        }
+        for pair in pairs
+    ]
+
+
+def _differ(pair: PairUncertainty, stages: Sequence[Stage]) -> str:
+    """By how much the two surfaces differ, before and after."""
+    key = (min(pair.i, pair.j), max(pair.i, pair.j))
+    known = [f"{stage.differences_mm[key]:.1f}" for stage in stages if key in stage.differences_mm]
+    return " → ".join(known) or UNKNOWN
 
 
 def kept_residuals(evidence: Sequence[EdgeEvidence]) -> Array:
@@ -137,7 +195,7 @@ def _pose_cells(camera: CalibratedCamera, viewpoint: Viewpoint) -> dict[str, str
     right = np.array([axis[1], -axis[0], 0.0]) / max(float(np.hypot(axis[0], axis[1])), 1e-9)
     roll = float(np.arctan2(image_up @ right, image_up @ np.cross(right, axis)))
     x, y, z = camera.T_rig_camera[:3, 3] * 1e3
-    sigma = worst_sigma(camera)
+    sigma, in_frame = worst_sigma(camera.aligned_covariance), worst_sigma(camera.covariance)
     correction = camera.depth_correction
     return {
         "position": f"{x:.1f}, {y:.1f}, {z:.1f}",
@@ -146,6 +204,8 @@ def _pose_cells(camera: CalibratedCamera, viewpoint: Viewpoint) -> dict[str, str
         "roll": _degrees(roll),
         "sigma_deg": f"{sigma.deg:.3f}" if sigma else UNKNOWN,
         "sigma_mm": f"{sigma.mm:.2f}" if sigma else UNKNOWN,
+        "sigma": str(sigma or UNKNOWN),
+        "sigma_frame": str(in_frame or UNKNOWN),
         "depth_scale": f"{100 * correction.coefficients[0]:+.2f} %" if correction else UNKNOWN,
     }
 

@@ -74,6 +74,10 @@ def test_a_ring_is_calibrated_in_its_drawings_frame(solve: Calibrate) -> None:
     assert calibration.rig_frame == "ring"
     assert all(camera.covariance is not None for camera in calibration.cameras)
     assert {edge.used for edge in calibration.edges} == {True}
+    consistency = errors.consistency()  # neighbours and aligned cameras have covariances of their own
+    assert {name: known.count for name, known in consistency.items()} == {"pairs": 12, "cameras": 12}
+    assert all(known.nees < 2.0 for known in consistency.values())
+    assert all(len(item.pixel_errors) > len(item.disparity_errors) > 0 for item in result.evidence)
     assert len(result.evidence) == 12
     assert result.poses_before.keys() == rig.truth.keys()
 
@@ -90,6 +94,8 @@ def test_the_papers_method_calibrates_and_closes_the_loop(solve: Calibrate) -> N
     assert loop.before_deg > 0.01
     assert loop.after_deg < 1e-6
     assert calibration.method == "paper"
+    assert all(edge.relative_covariance is None for edge in calibration.edges)
+    assert all(camera.aligned_covariance is None for camera in calibration.cameras)
 
 
 def test_a_knocked_camera_is_found_from_its_matches(solve: Calibrate) -> None:

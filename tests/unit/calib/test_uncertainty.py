@@ -2,10 +2,12 @@
 
 import numpy as np
 
+from rig_calib.alignment import align_frames
 from rig_calib.rig_adjustment import AdjustedRig, adjust_rig
 from rig_calib.settings import CalibrationSettings
 from rig_calib.uncertainty import PoseCovariance, weakest_direction
-from rig_protocol.poses import inverse, se3_exp, se3_log
+from rig_protocol.poses import adjoint, inverse, se3_exp, se3_log
+from rig_protocol.rig_folder import RingDrawing
 from support.synthetic_rig import SyntheticRig, true_matches
 
 # The observations' standard deviations are what the adjustment believes of keypoints one pixel wide.
@@ -45,6 +47,43 @@ def test_the_covariance_of_a_relative_pose_counts_what_the_poses_share() -> None
     measured = np.cov(np.array(deltas).T)
     scale = np.sqrt(np.outer(np.diag(predicted), np.diag(predicted)))
     assert np.abs((measured - predicted) / scale).max() < 0.1
+
+
+def sampled_ring(seed: int) -> tuple[list[np.ndarray], np.ndarray]:
+    """Poses of four cameras around a rig, and a joint covariance of them."""
+    rng = np.random.default_rng(seed)
+    poses = [RingDrawing().T_rig_camera(3 * k) for k in range(4)]
+    root = rng.normal(0, 5e-4, (24, 24))
+    return poses, root @ root.T
+
+
+def test_the_aligned_covariance_is_of_what_alignment_leaves() -> None:
+    """Monte Carlo: truths are drawn, the rig is laid on each as the evaluation does."""
+    poses, joint = sampled_ring(3)
+    aligned = PoseCovariance(joint.reshape(4, 6, 4, 6)).aligned(poses)
+    rng = np.random.default_rng(4)
+    left = []
+    for draw in rng.multivariate_normal(np.zeros(24), joint, 3000).reshape(-1, 4, 6):
+        truth = {k: T @ se3_exp(delta) for k, (T, delta) in enumerate(zip(poses, draw, strict=True))}
+        T_truth_rig = align_frames(dict(enumerate(poses)), truth)
+        left.append([se3_log(inverse(T_truth_rig @ poses[k]) @ truth[k]) for k in range(4)])
+    measured = np.cov(np.array(left).reshape(-1, 24).T)
+    predicted = aligned.blocks.reshape(24, 24)
+    scale = np.sqrt(np.outer(np.diag(predicted), np.diag(predicted)))
+    assert np.abs((measured - predicted) / scale).max() < 0.1
+
+
+def test_a_common_motion_of_the_rig_is_not_in_the_aligned_covariance_and_relative_poses_stay() -> None:
+    poses, joint = sampled_ring(5)
+    common = np.concatenate([adjoint(inverse(T)) for T in poses])  # the rig turned and shifted as one
+    moved = joint + common @ np.diag(np.repeat([0.02, 0.1], 3) ** 2) @ common.T
+    plain, loose = (PoseCovariance(C.reshape(4, 6, 4, 6)) for C in (joint, moved))
+    np.testing.assert_allclose(loose.aligned(poses).blocks, plain.aligned(poses).blocks, atol=1e-15)
+    T_i_j = inverse(poses[1]) @ poses[2]
+    np.testing.assert_allclose(
+        plain.aligned(poses).relative(1, 2, T_i_j), plain.relative(1, 2, T_i_j), atol=1e-15
+    )
+    assert np.trace(loose.of(0)) > 100 * np.trace(loose.aligned(poses).of(0))
 
 
 def test_covariances_are_symmetric_and_positive() -> None:
