@@ -19,6 +19,7 @@ Mask = npt.NDArray[np.bool_]
 _AZIMUTHS = 72  # directions in which the free floor is looked at
 _TALLEST_M = 1.9
 _ELBOW_ROOM_M = 0.32  # from the middle of a person to what stands around
+_ROUNDING = 4  # directions to both sides over which a corner is rounded
 _TURNS = 40  # stretches of walking or standing after which the round repeats
 _STRIDE_M = 1.4  # two steps
 _STEP_M = 0.18  # by which a foot leads
@@ -93,7 +94,7 @@ class _Walker:
         self._height = rng.uniform(0.92, 1.1)
         share = 0.5 + 0.5 * np.sin(np.arange(_AZIMUTHS) * 2 * np.pi / _AZIMUTHS + rng.uniform(0, 2 * np.pi))
         inner = KEEP_OUT_M + _ELBOW_ROOM_M / 2
-        self._radius_m = inner + share * np.maximum(free_m - _ELBOW_ROOM_M - inner, 0)
+        self._radius_m = _smooth(inner + share * np.maximum(free_m - _ELBOW_ROOM_M - inner, 0))
         duration_s, speed_m_s = rng.uniform(2, 8, _TURNS), rng.uniform(0.6, 1.3, _TURNS)
         speed_m_s *= rng.choice((-1, 1, 1, 0), _TURNS)
         self._times_s = np.concatenate([[0], np.cumsum(duration_s)])
@@ -132,6 +133,13 @@ def _body(height: float, step_m: float) -> tuple[Box, ...]:
         Box(0, 0, hip, (0.24, 0.46, neck - hip), "fabric"),
         Box(0.02, 0, neck, (0.2, 0.16, 0.25 * height), "paint"),
     )
+
+
+def _smooth(radius_m: Vector) -> Vector:
+    """The round without corners: the mean over directions of the least radius around each of them."""
+    shifts = range(-_ROUNDING, _ROUNDING + 1)
+    least = np.min([np.roll(radius_m, shift) for shift in shifts], axis=0)
+    return np.asarray(np.mean([np.roll(least, shift) for shift in shifts], axis=0))
 
 
 def _free_floor_m(scene: Scene) -> Vector:

@@ -21,20 +21,20 @@ Index = npt.NDArray[np.intp]
 
 _SMOOTH_DEPTH = 1.08  # farthest over nearest in a landmark's window: the image warps by depth
 _SAME_DEPTH = 0.06  # relative difference up to which both depth cameras see one surface
-_LEVELS = 1  # of the pyramid: overlaps are narrow, and both images nearly fit
-_MOST_SHIFT_PX = 16.0  # full pixels: 1.7°
+# Levels of the pyramid and largest shift in full pixels: where both images nearly fit, and where not.
+_NEAR, _FAR = (1, 16.0), (3, 60.0)
 _MIN_LANDMARKS, _MIN_BLOCKS = 12, 12
-_NOISE_OF_MEAN = 0.5  # standard deviation of the mean of the looks over that of one
+_NOISE_OF_MEAN = 0.5  # standard deviation of the mean of four looks over that of one
 # What is smooth over the overlap (lens, distortion of depth) is worth a few measurements, not all.
 _LENS_SIGMA_PX = 0.15  # halved pixels
-_DEPTH_SIGMA_STEPS, _INDEPENDENT_DEPTHS = 1.0, 8.0
+_DEPTH_SIGMA_STEPS, _INDEPENDENT_DEPTHS = 1.5, 5.0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class OverlapView:
-    """Motion of j against its place in the calibration, i in its own, and how alike both images are then.
+    """Motion of j against where the overlap takes it to be, i in its place.
 
-    `likeness`: correlation of the landmarks' windows, median, where the calibration says that they are.
+    `likeness`: correlation of the landmarks' windows, median, before that motion.
     """
 
     motion: Motion
@@ -43,7 +43,7 @@ class OverlapView:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Overlap:
-    """Where cameras i and j see the same, according to the calibration and to i's depth.
+    """Where cameras i and j see the same, when T_j_i is so, going by i's depth.
 
     `landmarks` (N,2) on the part `window` of i's halved image, `points` (N,3) in j, the derivative (N,2,6) of
     their shift by j's motion, the depth blocks (N,2) of i and j that they fall on; `warp`: where each pixel
@@ -61,10 +61,13 @@ class Overlap:
     landmark_blocks: Index
     pairs: Index
 
-    def view(self, looks: tuple[Look, Look], still: tuple[Mask, Mask]) -> OverlapView | None:
+    def view(
+        self, looks: tuple[Look, Look], still: tuple[Mask, Mask], *, far: bool = False
+    ) -> OverlapView | None:
         """What both cameras show of the overlap; None when too little of it is seen.
 
         `looks` of i and j at about one time, `still`: which depth blocks (N,) of each show what they did.
+        `far`: also shifts of some degrees, less surely.
         """
         calm = [
             undisturbed(mask, one.blocks.shape) for mask, one in zip(still, (self.i, self.j), strict=True)
@@ -79,8 +82,9 @@ class Overlap:
         other = np.asarray(warped, dtype=np.uint8)
         noise = _NOISE_OF_MEAN * max(self.i.noise_levels, self.j.noise_levels)
         tensors = gradient_tensors(one, self.landmarks)
-        shifts, found = track(one, other, self.landmarks, tensors, noise, _LENS_SIGMA_PX, levels=_LEVELS)
-        found &= np.abs(shifts.shift).max(axis=1) < _MOST_SHIFT_PX
+        levels, most_px = _FAR if far else _NEAR
+        shifts, found = track(one, other, self.landmarks, tensors, noise, _LENS_SIGMA_PX, levels=levels)
+        found &= np.abs(shifts.shift).max(axis=1) < most_px
         motion = estimate_motion((shifts.whitened(self.jacobian, use & found), depth))
         likeness = float(np.median(_correlation(one, other, self.landmarks[use])))
         return None if motion is None else OverlapView(motion, likeness)

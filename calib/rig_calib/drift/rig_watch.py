@@ -1,20 +1,18 @@
 """A watch of a whole rig: from panoramic frames and a calibration to what has moved."""
 
 from collections.abc import Iterable
+from dataclasses import dataclass
 from itertools import cycle, islice
 
 from rig_calib.drift.frame_looks import look_of_frame
 from rig_calib.drift.reference import CameraKnown
 from rig_calib.drift.watch import DriftStatus, DriftWatch
 from rig_calib.rig_calibration import RigCalibration
-from rig_protocol.errors import RigError
 from rig_protocol.frames import PanoramicFrame
 from rig_protocol.rig_folder import RigDescription
 
 MIN_LOOKS = 6
 """So many looks speak for a motion before it is told."""
-
-_JUDGED = ("in place", "moved")
 
 
 class RigWatch:
@@ -22,7 +20,12 @@ class RigWatch:
 
     def __init__(self, calibration: RigCalibration) -> None:
         self._calibration = calibration
-        self._watch = DriftWatch(calibration.poses)
+        covariances = {
+            (edge.i, edge.j): edge.relative_covariance
+            for edge in calibration.edges
+            if edge.relative_covariance is not None
+        }
+        self._watch = DriftWatch(calibration.poses, covariances)
 
     def take(self, description: RigDescription, panorama: PanoramicFrame) -> None:
         """Look at one panoramic frame; `description` holds the cameras' models."""
@@ -56,17 +59,24 @@ class RigWatch:
         return self._watch.status()
 
 
+@dataclass(frozen=True, slots=True)
+class Check:
+    """What frames say about a calibration; `unknown`: cameras of it of which they say nothing."""
+
+    status: DriftStatus
+    unknown: tuple[int, ...]
+
+
 def check(
     calibration: RigCalibration,
     description: RigDescription,
     panoramas: Iterable[PanoramicFrame],
     reference: Iterable[PanoramicFrame] = (),
-) -> DriftStatus:
+) -> Check:
     """Which cameras of a rig have moved since its calibration, going by frames taken now.
 
-    `reference`: frames taken right after the calibration from the same place, in the same room; with them far
-    smaller motions are seen. Where most cameras do not recognise them they are left out. RigError when nothing
-    can be compared.
+    `reference`: frames taken right after the calibration, from the same place and in the same room; with
+    them far smaller motions are seen. Where most cameras do not recognise them they are left out.
     """
     now, before = RigWatch(calibration), RigWatch(calibration)
     for panorama in reference:
@@ -83,10 +93,13 @@ def check(
     if before.looks and len(first) < MIN_LOOKS:
         for panorama in islice(cycle(first), MIN_LOOKS):  # a passer-by cannot be told from a bump in so few
             before.take(description, panorama)
-    status = before.status() if before.recognises() else now.status()
-    if not any(camera.state in _JUDGED for camera in status.cameras):
-        raise RigError(
-            "no camera can be compared with another: too little is seen in their overlaps; check that the "
-            "calibration is of this rig and its cameras deliver depth, or look at a room with more in it"
-        )
-    return status
+    if before.recognises():
+        return _result(calibration, before.status(), before.status().judged)
+    status = now.status()
+    compared = (camera.camera for camera in status.cameras if camera.compared)
+    return _result(calibration, status, frozenset(compared))
+
+
+def _result(calibration: RigCalibration, status: DriftStatus, known: frozenset[int]) -> Check:
+    known |= {camera.camera for camera in status.moved}
+    return Check(status, tuple(k for k in calibration.poses if k not in known))

@@ -21,9 +21,9 @@ State = Literal["learning", "in place", "moved", "not seen"]
 Evidence = Literal["its own view", "its overlaps", "the calibration"]
 
 _LEAST_SHARE = 0.08  # of an image that neighbours have in common
-_CONFIRMING_LOOKS = 5
+_CONFIRMING_LOOKS = 5  # all of them after the bump
 _CONTRADICTION = -9.0  # χ² by which overlaps speak against what a camera's own view says
-_CHI2, _CHI2_CALIBRATION = 40.0, 60.0
+_CHI2, _CHI2_CALIBRATION = 40.0, 45.0
 _ROUNDS = 3  # of all overlaps that must agree where a camera's own view tells nothing
 
 
@@ -32,7 +32,8 @@ class CameraDrift:
     """One camera at one moment.
 
     `deg`, `mm`: size of its rotation and translation, with standard deviations; 0 until it moved. `found_by`:
-    what told of it. `rivals`: cameras whose motion would explain as much.
+    what told of it. `rivals`: cameras whose motion would explain as much. `compared`: whether an overlap was
+    compared with the calibration; else the watch knows only of the time since it began.
     """
 
     camera: int
@@ -43,25 +44,32 @@ class CameraDrift:
     sigma_mm: float = 0.0
     found_by: Evidence | None = None
     rivals: tuple[int, ...] = ()
+    compared: bool = False
 
 
 @dataclass(frozen=True, slots=True)
 class PairDrift:
-    """What both cameras of a pair see lies so far apart, root mean square; None where they see too little."""
+    """What both cameras of a pair see lies so far apart, root mean square; None where that is too little."""
 
     i: int
     j: int
-    mm: float | None
+    mm: float | None = None
+    deg: float | None = None
 
 
 @dataclass(frozen=True, slots=True)
 class DriftStatus:
     """All cameras and pairs; `rig_mm`: by how much the whole rig was moved since its views were learnt."""
 
-    cameras: tuple[CameraDrift, ...]
-    pairs: tuple[PairDrift, ...]
-    rig_mm: float
-    looks: int
+    cameras: tuple[CameraDrift, ...] = ()
+    pairs: tuple[PairDrift, ...] = ()
+    rig_mm: float = 0.0
+    looks: int = 0
+
+    @property
+    def judged(self) -> frozenset[int]:
+        """Cameras of which something tells where they are."""
+        return frozenset(one.camera for one in self.cameras if one.state in ("in place", "moved"))
 
     @property
     def moved(self) -> tuple[CameraDrift, ...]:
@@ -72,9 +80,12 @@ class DriftStatus:
 class DriftWatch:
     """Watches the cameras that the calibration placed; `take` one look of each at a time."""
 
-    def __init__(self, poses: Mapping[int, Pose]) -> None:
-        """`poses`: T_rig_camera of the calibration."""
+    def __init__(
+        self, poses: Mapping[int, Pose], covariances: Mapping[tuple[int, int], Array] | None = None
+    ) -> None:
+        """`poses`: T_rig_camera of the calibration; `covariances` (6,6): of T_i_j, i < j, on its right."""
         self._poses = dict(poses)
+        self._covariances = covariances or {}
         self._known: dict[int, CameraKnown] = {}
         self._cameras: dict[int, WatchedCamera] = {}
         self._pairs: list[WatchedPair] = []
@@ -93,7 +104,8 @@ class DriftWatch:
         poses = {i: self._poses[i] for i in self._known}
         for i, j in neighbours(poses, self._known):
             if k in (i, j):
-                self._pairs.append(WatchedPair(i, j, inverse(poses[i]) @ poses[j]))
+                T_i_j = inverse(poses[i]) @ poses[j]
+                self._pairs.append(WatchedPair(i, j, T_i_j, self._covariances.get((i, j))))
 
     @property
     def recognising(self) -> int:
@@ -113,8 +125,10 @@ class DriftWatch:
                 self._cameras[k].see(look)
         self._test_views()
         due = self.looks % RECENT_LOOKS
-        for pair in self._pairs[due::RECENT_LOOKS]:  # a few at a time: each takes some 10 ms
-            self._look_at(pair)
+        for number, pair in enumerate(self._pairs):
+            new = pair.is_new(self._cameras[pair.i], self._cameras[pair.j])
+            if new or number % RECENT_LOOKS == due:  # a few at a time: each takes some 10 ms
+                self._look_at(pair)
         if due == 0:
             self._test_overlaps()
 
@@ -128,8 +142,9 @@ class DriftWatch:
 
     def status(self) -> DriftStatus:
         """What is known now."""
-        pairs = tuple(PairDrift(pair.i, pair.j, pair.residual_mm()) for pair in self._pairs)
-        return DriftStatus(tuple(map(self._drift, self._cameras)), pairs, self._rig_mm, self.looks)
+        cameras = tuple(replace(self._drift(k), compared=self._is_compared(k)) for k in self._cameras)
+        pairs = tuple(PairDrift(pair.i, pair.j, *(pair.residual() or ())) for pair in self._pairs)
+        return DriftStatus(cameras, pairs, self._rig_mm, self.looks)
 
     def _test_views(self) -> None:
         """What each camera's own view says, less what all of them say together."""
@@ -168,6 +183,9 @@ class DriftWatch:
         camera = self._cameras[k]
         return camera.times_learnt == 1 and camera.motion is not None
 
+    def _is_compared(self, k: int) -> bool:
+        return any(pair.first is not None for pair in self._pairs if k in (pair.i, pair.j))
+
     def _is_judged(self, k: int) -> bool:
         """Whether its own view or an overlap says where it is."""
         return self._cameras[k].motion is not None or any(
@@ -188,9 +206,7 @@ class DriftWatch:
             return _moved(k, before.delta, before.covariance, "the calibration", before.rivals)
         if camera.reference is None:
             return CameraDrift(k, "learning")
-        return CameraDrift(
-            k, "in place" if camera.test is not None and camera.motion is not None else "not seen"
-        )
+        return CameraDrift(k, "in place" if self._is_judged(k) else "not seen")
 
 
 def neighbours(poses: Mapping[int, Pose], known: Mapping[int, CameraKnown]) -> list[tuple[int, int]]:

@@ -11,6 +11,7 @@ from rig_calib.drift.movement_test import MovementTest
 from rig_calib.drift.own_motion import OwnView, compare
 from rig_calib.drift.reference import CameraKnown, Reference, learn_reference
 from rig_calib.drift.relocation import relocate
+from rig_protocol.poses import inverse, se3_log
 
 Array = npt.NDArray[np.float64]
 Mask = npt.NDArray[np.bool_]
@@ -48,7 +49,8 @@ class WatchedCamera:
                 self.learn()
             return
         if self._out_of_reach and self._seen % _RELOCATE_EVERY == 0:
-            self._far = relocate(self.reference, look)
+            T_now_before = relocate(self.reference, look.contrast, self._known.model.color)
+            self._far = None if T_now_before is None else se3_log(inverse(T_now_before))
         self._seen += 1
         view = compare(self.reference, look, self._far)
         self.recent.append((look, view.still))
@@ -58,6 +60,11 @@ class WatchedCamera:
             self._lost += 1
             if self._lost >= _LOST_LOOKS and not self._moved:
                 self.forget()
+
+    @property
+    def suspected(self) -> bool:
+        """Whether anything speaks for a motion."""
+        return self.test is not None and self.test.evidence > 0
 
     @property
     def _moved(self) -> bool:
