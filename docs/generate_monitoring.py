@@ -4,11 +4,12 @@ from collections.abc import Iterator
 from dataclasses import asdict
 from pathlib import Path
 
+from rig_calib.drift.watch import CameraDrift, DriftStatus, PairDrift
 from rig_protocol.clock_sync import ClockEstimate
 from rig_protocol.counters import CameraCounters
 from rig_server.durations import Durations
 from rig_server.exposition import families
-from rig_server.metrics import CameraMetrics, RigStatus
+from rig_server.metrics import CameraMetrics, DriftReport, RigStatus
 
 PAGE = Path(__file__).parent / "monitoring.md"
 
@@ -38,7 +39,7 @@ def _rows() -> Iterator[str]:
 
 def _label(name: str, values: list[str]) -> str:
     """Its values, too, where they are the same for every rig."""
-    if name in ("camera", "event", "gauge") or values == [""]:
+    if name in ("camera", "other", "event", "gauge") or values == [""]:
         return f"`{name}`"
     return f"`{name}`: {', '.join(values[:_MAX_VALUES])}"
 
@@ -58,6 +59,9 @@ def _every_metric() -> RigStatus:
     return RigStatus(
         (camera,),
         rejected={"": 0},
+        drift=DriftReport(
+            DriftStatus((CameraDrift(0, "in place"),), (PairDrift(0, 1, 0.0, 0.0),)), {0: "cam00", 1: "cam01"}
+        ),
         queues=dict.fromkeys(("decoder", "synchroniser", "sets"), 0),
         durations=Durations().snapshot(),
     )

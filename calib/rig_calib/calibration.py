@@ -18,13 +18,13 @@ from rig_calib.edges import TOLERANCE, Edge, measure_edge
 from rig_calib.evidence import EdgeEvidence
 from rig_calib.loops import closing_cycle
 from rig_calib.matching import Matches, flann_matches, mutual_matches
+from rig_calib.noise import NoiseModel
 from rig_calib.observed_camera import ObservedCamera, missing_images, observe
 from rig_calib.overlap import Region, shared_regions
 from rig_calib.pose_graph import chain_poses, loop_error, optimise, spanning_tree
-from rig_calib.registration import ransac
 from rig_calib.refinement import RefinedRig, refine
+from rig_calib.registration import ransac
 from rig_calib.reselection import corrected, edge_evidence
-from rig_calib.noise import NoiseModel
 from rig_calib.rig_adjustment import AT_REST, AdjustedRig, adjust_rig
 from rig_calib.rig_calibration import CalibratedCamera, CalibratedEdge, LoopClosure, RigCalibration
 from rig_calib.settings import CalibrationSettings
@@ -265,7 +265,7 @@ def _refined_edge(edge: Edge, matches: Mapping[Pair, Matches]) -> Edge:
 
 
 def _prediction_px(rig: AdjustedRig, pairs: Iterable[Pair]) -> dict[Pair, float]:
-    """Standard deviation, in pixels, with which the rig's poses predict where one camera sees another's point."""
+    """Standard deviation, in pixels, of where the poses put one camera's points in another."""
     out = {}
     for i, j in pairs:
         if i in rig.poses and j in rig.poses:

@@ -24,6 +24,8 @@ _EXAMPLES = """
 
 `rig-calib pose-graph map.g2o --out solved.g2o --robust` — optimise any graph of 3D poses
 
+`rig-calib check results/calibration.json captures/today` — has a camera moved since then?
+
 `rig-calib intrinsics board/*.png --board 9x6 --square-mm 25 --out unit.json` — measure one colour camera
 
 `rig-calib pattern --out patterns` — sheets to print and to hang where neighbours' views overlap
@@ -140,6 +142,45 @@ def fuse(
     console.print(f"{len(fused.cloud):,} points in {out / 'cloud.ply'}")
     for why in fused.cloud.skipped:
         console.print(why, style="yellow")
+
+
+@app.command()
+def check(
+    calibration: Annotated[Path, typer.Argument(help="The calibration.json of this rig.")],
+    folder: Annotated[Path, typer.Argument(help="Rig folder with frames taken now; no patterns are needed.")],
+    reference: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FOLDER",
+            help="Rig folder taken right after calibrating, from the same place: shows far smaller motions.",
+        ),
+    ] = None,
+    frames: Frames = None,
+    as_json: AsJson = False,
+) -> None:
+    """Say which cameras have moved since the calibration, and by how much; exit 0 when all are in place."""
+    from rich.console import Console
+
+    from rig_calib.drift.rig_watch import check as compare
+    from rig_calib.drift.words import camera_names, drift_table, moved_message, status_dict, unknown_message
+    from rig_calib.rig_folder_calibration import read_panoramas
+    from rig_protocol.errors import RigError
+    from rig_protocol.rig_folder import read_rig_description
+
+    set_up_logging("WARNING")
+    known, description = _load(calibration), read_rig_description(folder)
+    before = () if reference is None else read_panoramas(reference, read_rig_description(reference))
+    result = compare(known, description, read_panoramas(folder, description, frames), before)
+    names = camera_names(known)
+    if as_json:
+        _print_json({**status_dict(result.status, names), "unknown": result.unknown})
+    else:
+        Console(highlight=False).print(drift_table(result.status, names))
+    told = [moved_message(camera, names) for camera in result.status.moved]
+    if result.unknown:
+        told.append(unknown_message(result.unknown, names))
+    if told:
+        raise RigError("; ".join(told))
 
 
 @app.command()

@@ -82,12 +82,15 @@ def _adjusted_camera(
     settings: CalibrationSettings,
 ) -> AdjustedCamera:
     """A camera of the problem; where a depth correction was applied, less bias than the prior's is left."""
+    intrinsics_sigma, grid_pose_sigma, grid_intrinsics_sigma = model_sigmas(view)
     return AdjustedCamera(
         color=view.model.color,
         grid=grid,
         start=CameraState(start, np.zeros(settings.bias_terms)),
         bias_sigma=bias_sigma(grid, settings) * (1.0 if correction is None else _BIAS_LEFT),
-        **model_sigmas(view),
+        intrinsics_sigma=intrinsics_sigma,
+        grid_pose_sigma=grid_pose_sigma,
+        grid_intrinsics_sigma=grid_intrinsics_sigma,
         T_prior=start if held else None,
         pose_sigma=_HELD_SIGMA if held else None,
     )

@@ -51,9 +51,7 @@ class KeypointDepth:
 
     def select(self, keep: npt.NDArray[np.bool_]) -> "KeypointDepth":
         """The keypoints that a mask names."""
-        return KeypointDepth(
-            self.disparity[keep], self.slope[keep], self.grid_pixels[keep], self.sigma[keep]
-        )
+        return KeypointDepth(self.disparity[keep], self.slope[keep], self.grid_pixels[keep], self.sigma[keep])
 
 
 def mean_disparity(images: Sequence[Array]) -> Array:

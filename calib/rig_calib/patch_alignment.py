@@ -8,9 +8,10 @@ information on it, which is of rank one on an edge and nothing on a blank wall.
 from dataclasses import dataclass
 
 import cv2
-import numba
 import numpy as np
 import numpy.typing as npt
+
+from rig_protocol.compiled import compiled, inlined
 
 Array = npt.NDArray[np.float64]
 ImageF32 = npt.NDArray[np.float32]
@@ -19,7 +20,10 @@ RADIUS_PX = 7
 _BLUR_PX = 0.8  # so that bilinear interpolation is exact enough, and the noise of the mosaic is less
 _ITERATIONS = 12
 _CONVERGED_PX = 0.01
-_MIN_INSIDE = 0.999  # of a patch
+_RIDGE = 1e-3  # of the curvature: an edge does not slide far along itself
+_LEAST_VARIANCE = 1.0  # levels², of a patch with anything on it
+_LEAST_GAIN = 0.05
+_LEAST_DETERMINANT = 1e-3
 # Blurred noise is shared by neighbouring pixels: information counts a pixel as this share of one.
 _INDEPENDENT_SHARE = 0.3
 _MIN_SIGMA_LEVELS = 0.7  # no patch is known better than rounding and interpolation allow
@@ -61,7 +65,9 @@ def align_patches(
     correlation = np.full(count, -1.0)
     if count:
         window = _window(radius_px)
-        _align(source, target, source_pixels.astype(np.int64), affine, window, pixels, information, correlation)
+        _align(
+            source, target, source_pixels.astype(np.int64), affine, window, pixels, information, correlation
+        )
     return AlignedPatches(pixels, information, correlation)
 
 
@@ -71,123 +77,135 @@ def _window(radius_px: int) -> Array:
     return np.exp(-0.5 * (steps[:, None] ** 2 + steps[None, :] ** 2))
 
 
-@numba.njit(cache=True, nogil=True)  # type: ignore[untyped-decorator]
-def _align(source, target, at, affine, window, pixels, information, correlation):  # type: ignore[no-untyped-def]
-    radius = window.shape[0] // 2
-    side = window.shape[0]
-    height, width = source.shape
-    template = np.empty((side, side))
-    by_u = np.empty((side, side))
-    by_v = np.empty((side, side))
-    seen = np.empty((side, side))
-    total = window.sum()
+@compiled()
+def _align(
+    source: ImageF32,
+    target: ImageF32,
+    at: npt.NDArray[np.int64],
+    affine: Array,
+    window: Array,
+    pixels: Array,
+    information: Array,
+    correlation: Array,
+) -> None:
+    """Align all patches; `pixels` holds the starts and then the places."""
+    side = len(window)
+    buffers = np.empty((4, side, side))
+    patch, by_u, by_v, seen = buffers[0], buffers[1], buffers[2], buffers[3]
     for k in range(len(at)):
-        u, v = at[k, 0], at[k, 1]
-        x, y = pixels[k, 0], pixels[k, 1]
         A = affine[k]
         determinant = A[0, 0] * A[1, 1] - A[0, 1] * A[1, 0]
-        if not np.isfinite(x + y + determinant) or abs(determinant) < 1e-3:
-            continue
-        if u < radius + 1 or v < radius + 1 or u >= width - radius - 1 or v >= height - radius - 1:
-            continue
-        mean = 0.0
-        for r in range(side):
-            for c in range(side):
-                template[r, c] = source[v + r - radius, u + c - radius]
-                mean += window[r, c] * template[r, c]
-        mean /= total
-        power = 0.0
-        h00 = h01 = h11 = 0.0
-        m0 = m1 = t0 = t1 = 0.0
-        for r in range(side):
-            for c in range(side):
-                row, column = v + r - radius, u + c - radius
-                du = 0.5 * (source[row, column + 1] - source[row, column - 1])
-                dv = 0.5 * (source[row + 1, column] - source[row - 1, column])
-                # the gradient in the target's pixels: A^-T times the source's
-                by_u[r, c] = (A[1, 1] * du - A[1, 0] * dv) / determinant
-                by_v[r, c] = (-A[0, 1] * du + A[0, 0] * dv) / determinant
-                template[r, c] -= mean
-                w = window[r, c]
-                power += w * template[r, c] ** 2
-                m0 += w * by_u[r, c]
-                m1 += w * by_v[r, c]
-                t0 += w * by_u[r, c] * template[r, c]
-                t1 += w * by_v[r, c] * template[r, c]
-                h00 += w * by_u[r, c] ** 2
-                h01 += w * by_u[r, c] * by_v[r, c]
-                h11 += w * by_v[r, c] ** 2
-        if power < total * 1.0:  # a blank patch: less than a level of contrast
-            continue
-        # Gain and offset are marginalised: project the gradients off (1, template).
-        h00 -= m0 * m0 / total + t0 * t0 / power
-        h01 -= m0 * m1 / total + t0 * t1 / power
-        h11 -= m1 * m1 / total + t1 * t1 / power
-        ridge = 1e-3 * (h00 + h11) + 1e-9
-        d = (h00 + ridge) * (h11 + ridge) - h01 * h01
-        found = False
-        gain = 1.0
-        residual = 0.0
-        for _ in range(_ITERATIONS):
-            inside = True
-            mean = 0.0
-            for r in range(side):
-                for c in range(side):
-                    dx, dy = c - radius, r - radius
-                    px = x + A[0, 0] * dx + A[0, 1] * dy
-                    py = y + A[1, 0] * dx + A[1, 1] * dy
-                    if px < 0 or py < 0 or px >= width - 1 or py >= height - 1:
-                        inside = False
-                        break
-                    i, j = int(px), int(py)
-                    a, b = px - i, py - j
-                    value = (1 - b) * ((1 - a) * target[j, i] + a * target[j, i + 1]) + b * (
-                        (1 - a) * target[j + 1, i] + a * target[j + 1, i + 1]
-                    )
-                    seen[r, c] = value
-                    mean += window[r, c] * value
-                if not inside:
-                    break
-            if not inside:
-                found = False
-                break
-            mean /= total
-            cross = square = 0.0
-            for r in range(side):
-                for c in range(side):
-                    seen[r, c] -= mean
-                    cross += window[r, c] * seen[r, c] * template[r, c]
-                    square += window[r, c] * seen[r, c] ** 2
-            gain = cross / power
-            correlation[k] = cross / np.sqrt(square * power + 1e-12)
-            if gain <= 0.05:
-                found = False
-                break
-            g0 = g1 = residual = 0.0
-            for r in range(side):
-                for c in range(side):
-                    e = seen[r, c] / gain - template[r, c]
-                    w = window[r, c]
-                    g0 += w * by_u[r, c] * e
-                    g1 += w * by_v[r, c] * e
-                    residual += w * e * e
-            found = True
-            sx = -((h11 + ridge) * g0 - h01 * g1) / d
-            sy = -((h00 + ridge) * g1 - h01 * g0) / d
-            length = np.sqrt(sx * sx + sy * sy)
-            if length > 1.0:
-                sx, sy = sx / length, sy / length
-            x += sx
-            y += sy
-            if length < _CONVERGED_PX:
-                break
-        if not found:
-            correlation[k] = -1.0
-            continue
-        variance = max(residual / total, _MIN_SIGMA_LEVELS**2)
-        scale = _INDEPENDENT_SHARE / variance
-        pixels[k, 0], pixels[k, 1] = x, y
-        noise = _NOISE_GRADIENT * residual
-        information[k, 0, 0] = (h00 - noise) * scale
-        information[k, 0, 1] = information[k, 1, 0] = h01 * scale
-        information[k, 1, 1] = (h11 - noise) * scale
+        sound = (
+            np.isfinite(pixels[k, 0] + pixels[k, 1] + determinant) and abs(determinant) > _LEAST_DETERMINANT
+        )
+        if sound and _cut_out(source, at[k, 0], at[k, 1], A, window, patch, by_u, by_v):
+            power = (window * patch * patch).sum()
+            if power > window.sum() * _LEAST_VARIANCE:
+                found = pixels[k], information[k], correlation[k : k + 1]
+                _align_one(target, A, window, patch, by_u, by_v, seen, power, *found)
+
+
+@inlined
+def _cut_out(
+    image: ImageF32, u: int, v: int, A: Array, window: Array, patch: Array, by_u: Array, by_v: Array
+) -> bool:
+    """The patch around (u, v) without its mean, and its gradient by pixels of the target: A⁻ᵀ∇."""
+    side = len(window)
+    left, top = u - side // 2, v - side // 2
+    if left < 1 or top < 1 or left + side >= image.shape[1] or top + side >= image.shape[0]:
+        return False
+    determinant = A[0, 0] * A[1, 1] - A[0, 1] * A[1, 0]
+    mean = 0.0
+    for r in range(side):
+        for c in range(side):
+            row, column = top + r, left + c
+            du = 0.5 * (image[row, column + 1] - image[row, column - 1])
+            dv = 0.5 * (image[row + 1, column] - image[row - 1, column])
+            by_u[r, c] = (A[1, 1] * du - A[1, 0] * dv) / determinant
+            by_v[r, c] = (A[0, 0] * dv - A[0, 1] * du) / determinant
+            patch[r, c] = image[row, column]
+            mean += window[r, c] * patch[r, c]
+    patch -= mean / window.sum()
+    return True
+
+
+@inlined
+def _align_one(
+    target: ImageF32,
+    A: Array,
+    window: Array,
+    patch: Array,
+    by_u: Array,
+    by_v: Array,
+    seen: Array,
+    power: float,
+    pixel: Array,
+    information: Array,
+    correlation: Array,
+) -> None:
+    """Gauss-Newton on the place of one patch; its correlation is −1 where it is lost."""
+    total, x, y, residual = window.sum(), pixel[0], pixel[1], 0.0
+    huu, huv, hvv = _curvature(window, patch, by_u, by_v, power)
+    ridge = _RIDGE * (huu + hvv) + 1e-9
+    determinant = (huu + ridge) * (hvv + ridge) - huv * huv
+    for _ in range(_ITERATIONS):
+        if not _sample(target, x, y, A, window, seen):
+            correlation[0] = -1.0
+            return
+        cross, square = (window * seen * patch).sum(), (window * seen * seen).sum()
+        gain = cross / power
+        if gain < _LEAST_GAIN:
+            correlation[0] = -1.0
+            return
+        correlation[0] = cross / np.sqrt(square * power + 1e-12)
+        error = seen / gain - patch
+        gu, gv = (window * by_u * error).sum(), (window * by_v * error).sum()
+        residual = (window * error * error).sum()
+        step_u = (huv * gv - (hvv + ridge) * gu) / determinant
+        step_v = (huv * gu - (huu + ridge) * gv) / determinant
+        length = np.sqrt(step_u * step_u + step_v * step_v)
+        shorter = 1.0 / max(length, 1.0)
+        x, y = x + step_u * shorter, y + step_v * shorter
+        if length < _CONVERGED_PX:
+            break
+    noise = _NOISE_GRADIENT * residual
+    scale = _INDEPENDENT_SHARE / max(residual / total, _MIN_SIGMA_LEVELS**2)
+    pixel[0], pixel[1] = x, y
+    information[0, 0], information[1, 1] = (huu - noise) * scale, (hvv - noise) * scale
+    information[0, 1] = information[1, 0] = huv * scale
+
+
+@inlined
+def _curvature(
+    window: Array, patch: Array, by_u: Array, by_v: Array, power: float
+) -> tuple[float, float, float]:
+    """Σ w ∇∇ᵀ with offset and gain marginalised: gradients without their parts along 1 and the patch."""
+    total = window.sum()
+    mu, mv = (window * by_u).sum(), (window * by_v).sum()
+    pu, pv = (window * by_u * patch).sum(), (window * by_v * patch).sum()
+    return (
+        (window * by_u * by_u).sum() - mu * mu / total - pu * pu / power,
+        (window * by_u * by_v).sum() - mu * mv / total - pu * pv / power,
+        (window * by_v * by_v).sum() - mv * mv / total - pv * pv / power,
+    )
+
+
+@inlined
+def _sample(target: ImageF32, x: float, y: float, A: Array, window: Array, seen: Array) -> bool:
+    """The target's values, without their mean, where A maps the patch's pixels; False outside."""
+    side = len(window)
+    reach, mean = side // 2, 0.0
+    for r in range(side):
+        for c in range(side):
+            px = x + A[0, 0] * (c - reach) + A[0, 1] * (r - reach)
+            py = y + A[1, 0] * (c - reach) + A[1, 1] * (r - reach)
+            if px < 0 or py < 0 or px >= target.shape[1] - 1 or py >= target.shape[0] - 1:
+                return False
+            column, row = int(px), int(py)
+            a, b = px - column, py - row
+            upper = (1.0 - a) * target[row, column] + a * target[row, column + 1]
+            lower = (1.0 - a) * target[row + 1, column] + a * target[row + 1, column + 1]
+            seen[r, c] = (1.0 - b) * upper + b * lower
+            mean += window[r, c] * seen[r, c]
+    seen -= mean / window.sum()
+    return True

@@ -1,9 +1,9 @@
-"""Patches instead of keypoints: points spread over every overlap, found in the other camera by direct alignment.
+"""Patches instead of keypoints: spread over every overlap, found in the other camera by direct alignment.
 
 Poses and depth of a first estimate say where a pixel of one camera must lie in the other. Around that place
 the image itself is aligned, to a few hundredths of a pixel and with the information that its texture holds;
-where a wall is blank, depth is compared alone (a point-to-plane term). What is found takes the keypoints' place
-in the same adjustment.
+where a wall is blank, depth is compared alone (a point-to-plane term). What is found takes the place of the
+keypoints in the same adjustment.
 """
 
 from collections.abc import Mapping, Sequence, Set
@@ -15,10 +15,9 @@ import numpy.typing as npt
 
 from rig_calib.depth_model import DepthCorrection
 from rig_calib.features import Keypoints
-from rig_calib.keypoint_depth import KeypointDepth
 from rig_calib.matching import Matches
 from rig_calib.observed_camera import ObservedCamera
-from rig_calib.overlap import Region, whole_image
+from rig_calib.overlap import Region
 from rig_calib.patch_alignment import RADIUS_PX, ImageF32, align_patches
 from rig_calib.projection import inside
 from rig_calib.surface_transfer import surface_planes, transfer, transfer_affine
@@ -70,8 +69,8 @@ def refine(
 ) -> RefinedRig:
     """Find patches for every pair whose cameras both have a pose.
 
-    `prediction_px` is the standard deviation, in pixels, with which the poses predict where a patch lies. Pairs
-    of `depth_only` compare depth alone, which leads to the right place from farther away than texture does.
+    `prediction_px` is the standard deviation, in pixels, with which the poses predict where a patch lies.
+    Pairs of `depth_only` compare depth alone, which leads to the right place from farther away than texture.
     """
     spread = {c: _spread_pixels(camera.image) for c, camera in cameras.items() if c in poses}
     halves = []
@@ -125,7 +124,9 @@ def _align_half(
     if prediction_px is None:
         return _Half(*ids, pixels.astype(np.float64), start, np.zeros((len(pixels), 2, 2)))
     affine = transfer_affine(*colors, T_target_source, planes, pixels.astype(np.float64))
-    found, information, correlation = _align_from_coarse(source.image, target.image, pixels, start, affine, prediction_px)
+    found, information, correlation = _align_from_coarse(
+        source.image, target.image, pixels, start, affine, prediction_px
+    )
     information = _with_floor(information)
     moved = np.linalg.norm(found - start, axis=1)
     good = (

@@ -15,8 +15,8 @@ from rig_calib.observed_camera import ObservedCamera
 from rig_calib.projection import from_pixels
 from rig_calib.settings import CalibrationSettings
 from rig_calib.tracks import Scene, build_scene, build_tracks
-from rig_calib.view import CameraView
 from rig_calib.uncertainty import PoseCovariance, pose_covariance
+from rig_calib.view import CameraView
 from rig_protocol.camera import ModelSource
 from rig_protocol.poses import Pose, inverse
 from rig_protocol.rig_folder import RingDrawing
@@ -135,14 +135,12 @@ def adjust_rig(
     )
 
 
-def model_sigmas(view: CameraView) -> dict[str, Array]:
-    """How far a view's models may be off, as the fields of `AdjustedCamera` that say it."""
-    sigma, own_grid = _MODEL_SIGMA[view.model.source], view.depth_frame == "depth"
-    return {
-        "intrinsics_sigma": sigma.intrinsics,
-        "grid_pose_sigma": sigma.grid_pose if own_grid else np.zeros(GRID_POSE_TERMS),
-        "grid_intrinsics_sigma": sigma.grid_intrinsics if own_grid else np.zeros(GRID_INTRINSIC_TERMS),
-    }
+def model_sigmas(view: CameraView) -> tuple[Array, Array, Array]:
+    """How far a view's models may be off: `AdjustedCamera`'s sigmas but those of pose and depth bias."""
+    sigma = _MODEL_SIGMA[view.model.source]
+    if view.depth_frame == "color":  # depth has no camera of its own
+        return sigma.intrinsics, np.zeros(GRID_POSE_TERMS), np.zeros(GRID_INTRINSIC_TERMS)
+    return sigma.intrinsics, sigma.grid_pose, sigma.grid_intrinsics
 
 
 def _adjusted_camera(
@@ -152,12 +150,15 @@ def _adjusted_camera(
     pose_sigma = None
     if ring is not None:
         pose_sigma = np.repeat([np.deg2rad(ring.tolerance_deg), ring.tolerance_m], 3)
+    intrinsics_sigma, grid_pose_sigma, grid_intrinsics_sigma = model_sigmas(camera.view)
     return AdjustedCamera(
         color=model.color,
         grid=camera.grid,
         start=CameraState(start, np.zeros(settings.bias_terms)),
         bias_sigma=bias_sigma(camera.grid, settings),
-        **model_sigmas(camera.view),
+        intrinsics_sigma=intrinsics_sigma,
+        grid_pose_sigma=grid_pose_sigma,
+        grid_intrinsics_sigma=grid_intrinsics_sigma,
         T_prior=None if ring is None else camera.view.T_rig_nominal,
         pose_sigma=pose_sigma,
         fixed_pose=fixed,

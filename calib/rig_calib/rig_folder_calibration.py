@@ -2,6 +2,7 @@
 
 import dataclasses
 import time
+from collections.abc import Iterator
 from pathlib import Path
 
 from rig_calib.calibration import CalibrationResult, calibrate
@@ -71,17 +72,22 @@ def _with_load(calibration: RigCalibration, load_s: float) -> RigCalibration:
 
 def read_views(folder: Path, description: RigDescription, frames: int | None = None) -> list[CameraView]:
     """Views of every camera of the folder; a camera may lack frames that others have."""
+    return views_from_panoramas(description, list(read_panoramas(folder, description, frames)))
+
+
+def read_panoramas(
+    folder: Path, description: RigDescription, frames: int | None = None
+) -> Iterator[PanoramicFrame]:
+    """The first `frames` panoramic frames of the folder (default: all, at most 100), read one by one."""
     held = {camera.id: frame_indices(folder, camera.name) for camera in description.cameras}
     indices = sorted({index for own in held.values() for index in own})
     if not indices or (frames is not None and frames > len(indices)):
         wanted = "one" if frames is None else frames
         raise ConfigurationError(f"{folder} holds {len(indices)} panoramic frames, {wanted} asked for")
-    panoramas = []
     for index in indices[: frames or MAX_FRAMES]:
         found: dict[int, RgbdFrame | None] = {
             camera.id: read_frame(folder, camera, index)
             for camera in description.cameras
             if index in held[camera.id]
         }
-        panoramas.append(PanoramicFrame.of(index, found))
-    return views_from_panoramas(description, panoramas)
+        yield PanoramicFrame.of(index, found)

@@ -33,7 +33,9 @@ def surface_planes(grid: DepthGrid, depth: KeypointDepth, correction: DepthCorre
     return np.asarray(turned / (1.0 + turned @ grid.T_color_grid[:3, 3])[:, None])
 
 
-def transfer(source: Intrinsics, target: Intrinsics, T_target_source: Pose, planes: Array, pixels: Array) -> Array:
+def transfer(
+    source: Intrinsics, target: Intrinsics, T_target_source: Pose, planes: Array, pixels: Array
+) -> Array:
     """Pixels (N,2) of the target at which the source's pixels (N,2) appear; NaN where that is nowhere."""
     rays = np.column_stack([undistort_pixels(source, pixels), np.ones(len(pixels))])
     depth_m = 1.0 / np.einsum("ni,ni->n", planes, rays)

@@ -83,9 +83,7 @@ def _mean_points(
     return np.stack(sums, axis=1) / np.maximum(depths, 1)[:, None], depths > 0
 
 
-def _observations(
-    observed: "_Columns", point: npt.NDArray[np.intp], noise: NoiseModel
-) -> Observations:
+def _observations(observed: "_Columns", point: npt.NDArray[np.intp], noise: NoiseModel) -> Observations:
     pixels = observed.gather(lambda c: c.keypoints.pixels, 2)
     grid_pixels = observed.gather(lambda c: c.depth.grid_pixels, 2)
     information = observed.gather(lambda c: c.keypoints.information.reshape(-1, 4), 4).reshape(-1, 2, 2)

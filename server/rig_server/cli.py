@@ -25,6 +25,8 @@ _EXAMPLES = """
 
 `rig-server` — receive on UDP port 4012 and show the live table until Ctrl-C
 
+`rig-server --watch calibration/calibration.json` — the same, and an alarm when a camera has moved
+
 `rig-server --metrics 9100` — the same, and metrics for a Prometheus on this machine
 
 `rig-server --calibrate --out calibration` — calibrate the ring that streams to this PC
@@ -106,6 +108,10 @@ def run(
     out: Annotated[
         Path | None, typer.Option(metavar="DIR", help="Folder for the results; else ./calibration.")
     ] = None,
+    watch: Annotated[
+        Path | None,
+        typer.Option(metavar="CALIBRATION", help="Say when a camera moves from its place in this file."),
+    ] = None,
     insecure: Annotated[
         bool, typer.Option("--insecure", help="Take frames of anybody: only on an isolated bench.")
     ] = False,
@@ -135,20 +141,25 @@ def run(
         seed,
         listen,
     )
-    from rig_server.config import load_rig_settings
+    from rig_server.config import WatchSettings, load_rig_settings
 
+    if watch is not None and calibrate:
+        raise ConfigurationError("--watch has no effect with --calibrate, which measures all places anew")
     changes = {
         "listen": listen,
         "insecure": insecure or None,
         "metrics": metrics,
         "capture": {"frames": frames, "target_mm": target_mm, "target_deg": target_deg},
         "calibration": {"method": method},
+        "watch": {"calibration": watch},
     }
     settings = load_rig_settings(config, changes)
     if calibrate and settings.synchroniser.policy == "latest":
         raise ConfigurationError(
             'synchroniser.policy = "latest" repeats frames, which a calibration must not: use "partial"'
         )
+    if calibrate:  # what is measured anew is not watched over
+        settings = settings.model_copy(update={"watch": WatchSettings()})
     console = Console()
     set_up_logging(settings.log_level, console)
     # What takes a second to import comes after everything that can be refused at once.

@@ -112,6 +112,15 @@ class CaptureSettings(Settings):
     """How long to wait for the expected cameras, and then for complete sets."""
 
 
+class WatchSettings(Settings):
+    """The drift watch: whether a camera has moved since the rig was calibrated (docs/drift.md)."""
+
+    calibration: Path | None = Field(None, examples=[Path("calibration/calibration.json")])
+    """The calibration to watch over; unset: nobody watches."""
+    every: int = Field(4, ge=1, le=1000)
+    """It looks at one panoramic frame in so many; a look at twelve cameras takes some 60 ms of one core."""
+
+
 class RigSettings(Settings):
     """Settings of rig-server. Write your own values over the defaults below."""
 
@@ -137,6 +146,7 @@ class RigSettings(Settings):
     link: LinkSettings = LinkSettings()
     capture: CaptureSettings = CaptureSettings()
     calibration: CalibrationSettings = CalibrationSettings()
+    watch: WatchSettings = WatchSettings()
     ring: RingSettings | None = None
     """The drawing of the ring; leave it out when the cameras' places are unknown."""
     cameras: tuple[CameraSettings, ...] = ()
@@ -189,7 +199,11 @@ def load_rig_settings(file: Path | None, overrides: Mapping[str, Any] | None = N
     if found is None:
         return settings
     cameras = [_beside(found, camera) for camera in settings.cameras]
-    return settings.model_copy(update={"cameras": tuple(cameras)})
+    watch = settings.watch
+    # Where the command line names a calibration, it is relative to where that was typed.
+    if watch.calibration is not None and not _overridden(overrides, "watch", "calibration"):
+        watch = watch.model_copy(update={"calibration": found.parent / watch.calibration})
+    return settings.model_copy(update={"cameras": tuple(cameras), "watch": watch})
 
 
 def parse_address(text: str) -> Address:
@@ -215,6 +229,10 @@ def read_intrinsics(path: Path) -> CameraModel:
         return CameraModel.from_dict(read_json(path))
     except DataError as error:
         raise ConfigurationError(f"intrinsics file {path}: {error}") from error
+
+
+def _overridden(overrides: Mapping[str, Any] | None, table: str, key: str) -> bool:
+    return ((overrides or {}).get(table) or {}).get(key) is not None
 
 
 def _beside(file: Path, camera: CameraSettings) -> CameraSettings:

@@ -8,7 +8,7 @@ from prometheus_client.registry import Collector
 
 from rig_server.durations import SPREAD, STAGES, UNCERTAINTY
 from rig_server.histogram import HistogramSnapshot
-from rig_server.metrics import TEMPERATURE, CameraMetrics, RigStatus
+from rig_server.metrics import TEMPERATURE, CameraMetrics, DriftReport, RigStatus
 
 # Fields of CameraCounters that have a metric of their own: its name and what it counts.
 _COUNTERS = {
@@ -71,6 +71,7 @@ def families(status: RigStatus) -> Iterator[Metric]:
     yield from _agents(status.cameras)
     yield from _sets(status)
     yield from _rig(status)
+    yield from _drift(status.drift)
 
 
 def _arrivals(cameras: Iterable[CameraMetrics]) -> Iterator[Metric]:
@@ -161,6 +162,31 @@ def _rig(status: RigStatus) -> Iterator[Metric]:
     yield GaugeMetricFamily(
         "rig_receive_buffer_bytes", "How much of the kernel's receive buffer is taken.", status.unread_bytes
     )
+
+
+def _drift(drift: DriftReport | None) -> Iterator[Metric]:
+    moved = _gauge("rig_camera_moved", "1 when the camera is not where its calibration says.", "camera")
+    shift_mm = _gauge("rig_camera_shift_mm", "By how many millimetres it moved.", "camera")
+    shift_deg = _gauge("rig_camera_shift_deg", "By how many degrees it turned.", "camera")
+    judged = _gauge("rig_camera_watched", "1 while the drift watch can tell where the camera is.", "camera")
+    apart = _gauge("rig_overlap_residual_mm", "How far apart two cameras see one place.", "camera", "other")
+    looks = _counter(
+        "rig_drift_looks", "Sets that the drift watch looked at, and that found it busy.", "outcome"
+    )
+    if drift is not None:
+        names = drift.names
+        for one in drift.status.cameras:
+            labels = [names.get(one.camera, str(one.camera))]
+            moved.add_metric(labels, one.state == "moved")
+            shift_mm.add_metric(labels, one.mm)
+            shift_deg.add_metric(labels, one.deg)
+            judged.add_metric(labels, one.camera in drift.status.judged)
+        for pair in drift.status.pairs:
+            if pair.mm is not None:
+                apart.add_metric([names.get(k, str(k)) for k in (pair.i, pair.j)], pair.mm)
+        looks.add_metric(["looked"], drift.status.looks)
+        looks.add_metric(["busy"], drift.passed_over)
+    yield from (moved, shift_mm, shift_deg, judged, apart, looks)
 
 
 def _told_gauges(gauges: Mapping[str, float]) -> dict[str, float]:

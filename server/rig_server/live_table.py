@@ -11,7 +11,7 @@ from rich.table import Table
 from rich.text import Text
 
 from rig_server.metrics import CameraMetrics, RigStatus
-from rig_server.status_words import summary
+from rig_server.status_words import alarms, summary
 
 _LINE_EVERY_S = 5.0
 
@@ -20,6 +20,7 @@ _HIGH_LOSS = 0.001  # a complete set in a thousand is missing for it
 _HIGH_CLOCK_ERROR_US = 500.0
 _HIGH_TEMPERATURE_C = 80.0  # a Pi slows down
 _CALM, _PLAIN, _TROUBLE = "dim", "", "bold not dim yellow"
+_ALARM = "bold not dim red"
 
 
 class LiveDisplay:
@@ -68,7 +69,8 @@ def status_table(status: RigStatus, title: str) -> RenderableType:
     figures, troubles = summary(status)
     if not status.cameras:
         figures = ["waiting for cameras"]
-    return Group(table, *map(Text, figures), *(Text(line, _TROUBLE) for line in troubles))
+    lines = [Text(line) for line in figures] + [Text(line, _TROUBLE) for line in troubles]
+    return Group(table, *lines, *(Text(line, _ALARM) for line in alarms(status)))
 
 
 def status_line(status: RigStatus) -> str:
@@ -77,7 +79,7 @@ def status_line(status: RigStatus) -> str:
     parts = [f"{status.connected}/{len(status.cameras)} cameras", *figures]
     if resent := sum(camera.resent for camera in status.cameras):
         parts.append(f"{resent} fragments resent")
-    parts += troubles
+    parts += [*troubles, *alarms(status)]
     if away := [camera.name for camera in status.cameras if not camera.connected]:
         parts.append(f"not connected: {', '.join(away)}")
     worst = max(status.cameras, key=lambda camera: camera.loss, default=None)

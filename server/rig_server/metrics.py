@@ -5,6 +5,7 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
+from rig_calib.drift.watch import DriftStatus
 from rig_protocol.clock_sync import ClockEstimate
 from rig_server.assembler import SetRecord
 from rig_server.histogram import HistogramSnapshot
@@ -52,6 +53,19 @@ class CameraMetrics:
 
 
 @dataclass(frozen=True, slots=True)
+class DriftReport:
+    """What the drift watch says: of every camera, and how many sets it looked at and passed over being busy.
+
+    `names` by camera id are the calibration's; `failure`: why it watches no more.
+    """
+
+    status: DriftStatus
+    names: Mapping[int, str]
+    passed_over: int = 0
+    failure: str | None = None
+
+
+@dataclass(frozen=True, slots=True)
 class RigStatus:
     """The rig at one moment.
 
@@ -59,7 +73,7 @@ class RigStatus:
     to no camera, by cause. `repeated`: frames that went out once more. `queues`: frames or sets that wait, by
     place; `unread_bytes`: how much of the kernel's receive buffer is taken. `durations`: histograms since the
     start, by the names in `rig_server.durations`; `recent`: the same of the last half minute. `link`: what is
-    sent and what that takes, in words.
+    sent and what that takes, in words. `drift`: what the drift watch says, None where nobody watches.
     """
 
     cameras: tuple[CameraMetrics, ...]
@@ -76,6 +90,7 @@ class RigStatus:
     durations: Mapping[str, HistogramSnapshot] = field(default_factory=dict)
     recent: Mapping[str, HistogramSnapshot] = field(default_factory=dict)
     link: str | None = None
+    drift: DriftReport | None = None
     authenticated: bool = False
 
     @property

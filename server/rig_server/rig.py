@@ -4,11 +4,13 @@ import re
 import secrets
 import time
 from collections.abc import Callable, Iterator, Mapping
+from dataclasses import replace
 from pathlib import Path
 from types import TracebackType
 from typing import Protocol, Self
 
-from rig_protocol.errors import ConfigurationError, RigError
+from rig_calib.rig_calibration import RigCalibration
+from rig_protocol.errors import ConfigurationError, DataError, RigError
 from rig_protocol.frames import PanoramicFrame
 from rig_protocol.key_file import rig_key
 from rig_protocol.messages import Hello
@@ -20,6 +22,7 @@ from rig_server.metrics import RigStatus
 from rig_server.pipeline import LivePipeline
 from rig_server.recorded import RecordedRig
 from rig_server.simulation import SIMULATED_FPS, Simulation, simulated_settings
+from rig_server.sinks.watch import WatchSink
 
 _POLL_S = 0.25  # how soon a dead thread or a dead simulated agent is noticed while nothing comes
 _LIVE_SOURCE = re.compile(r"(udp|simulated):(?://)?(.*)")
@@ -84,6 +87,7 @@ class Rig:
         self.settings = settings
         self._feed = feed
         self._simulation = simulation
+        self._watch = _watch(settings)
 
     @classmethod
     def open(cls, source: str | Path, settings: RigSettings | None = None) -> Self:
@@ -126,6 +130,8 @@ class Rig:
         try:
             if self._simulation is not None:
                 self._simulation.start()
+            if self._watch is not None:
+                self._watch.start()
             self._feed.start()
         except BaseException:
             self.close()
@@ -150,6 +156,8 @@ class Rig:
         try:
             self._feed.stop()  # first: agents that we end ourselves are no news
         finally:  # also when somebody loses patience and presses Ctrl-C again
+            if self._watch is not None:
+                self._watch.stop()
             if self._simulation is not None:
                 self._simulation.close()
 
@@ -157,7 +165,10 @@ class Rig:
         """The next set; None when none came within `timeout_s`. RigError when the rig broke."""
         if self._simulation is not None:
             self._simulation.check()
-        return self._feed.next_panorama(timeout_s)
+        panorama = self._feed.next_panorama(timeout_s)
+        if panorama is not None and self._watch is not None:
+            self._watch.offer(panorama, lambda: self.description)
+        return panorama
 
     def wait_for_cameras(
         self, timeout_s: float = 60.0, on_wait: Callable[[RigStatus], None] | None = None
@@ -203,11 +214,23 @@ class Rig:
 
     def status(self) -> RigStatus:
         """Rates and losses of every camera, and of the sets."""
-        return self._feed.status()
+        status = self._feed.status()
+        return status if self._watch is None else replace(status, drift=self._watch.report())
 
     def true_poses(self) -> Mapping[int, Pose] | None:
         """True T_rig_camera by camera id; None where nobody knows them."""
         return None if self._simulation is None else self._simulation.true_poses()
+
+
+def _watch(settings: RigSettings) -> WatchSink | None:
+    """The drift watch, where settings ask for it; ConfigurationError when its calibration cannot be read."""
+    file = settings.watch.calibration
+    if file is None:
+        return None
+    try:
+        return WatchSink(RigCalibration.load(file), settings.watch.every)
+    except DataError as error:
+        raise ConfigurationError(f"watch.calibration: {error}") from error
 
 
 def _listening_at(address: str, settings: RigSettings) -> RigSettings:

@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping
 
+from rig_calib.drift.words import moved_message
 from rig_server.durations import (
     EXPOSURE_TO_RECEIVED,
     RECEIVED_TO_DECODED,
@@ -35,6 +36,16 @@ def summary(status: RigStatus) -> tuple[list[str], list[str]]:
         "rejected datagrams": _counts(status.rejected, _MOST_CAUSES),
     }
     return figures, [f"{what}: {which}" for what, which in troubles.items() if which]
+
+
+def alarms(status: RigStatus) -> list[str]:
+    """What must not be overlooked: cameras that moved, and a drift watch that has ended."""
+    if status.drift is None:
+        return []
+    told = [moved_message(camera, status.drift.names) for camera in status.drift.status.moved]
+    if status.drift.failure is not None:
+        told.append(f"the drift watch has ended: {status.drift.failure}; start the server again")
+    return told
 
 
 def _sets(status: RigStatus) -> str:

@@ -2,12 +2,13 @@
 
 from dataclasses import asdict, fields
 
+from rig_calib.drift.watch import CameraDrift, DriftStatus, PairDrift
 from rig_protocol.clock_sync import ClockEstimate
 from rig_protocol.counters import CameraCounters
 from rig_protocol.frames import RgbdFrame
 from rig_server.assembler import SetRecord
 from rig_server.durations import Durations
-from rig_server.metrics import CameraMetrics, RigStatus
+from rig_server.metrics import CameraMetrics, DriftReport, RigStatus
 
 MS = 1_000_000
 
@@ -41,6 +42,12 @@ def full_camera(camera_id: int = 0) -> CameraMetrics:
     )
 
 
+def full_drift() -> DriftStatus:
+    """Camera 1 has moved, and its overlap with camera 0 shows it."""
+    moved = CameraDrift(1, "moved", 0.52, 6.25, 0.01, 0.3, "its own view")
+    return DriftStatus((CameraDrift(0, "in place"), moved), (PairDrift(0, 1, 7.5, 0.21),), 0.4, 61)
+
+
 def full_status() -> RigStatus:
     """Two cameras, of which the second is away."""
     durations = full_durations().snapshot()
@@ -66,5 +73,6 @@ def full_status() -> RigStatus:
         unread_bytes=4096,
         durations=durations,
         recent=durations,
+        drift=DriftReport(full_drift(), {0: "cam00", 1: "cam01"}, passed_over=41),
         link="12 cameras at 30 fps need 72.1 MB/s, 60% of the link",
     )

@@ -1,9 +1,13 @@
 """How a Kinect's colour camera spoils what it sees: soft lens, exposure, vignetting, mosaic, noise."""
 
+from collections.abc import Sequence
+from dataclasses import dataclass
+
 import cv2
 import numpy as np
 import numpy.typing as npt
 
+from rig_agent.simulator.lens import Plane
 from rig_agent.simulator.noise_bank import NoiseBank
 from rig_protocol.frames import ImageU8
 
@@ -18,6 +22,19 @@ _MOSAIC = ((_GREEN, _RED), (_BLUE, _GREEN))
 """Channel (of BGR) at even and odd rows and columns: GRBG."""
 
 
+@dataclass(frozen=True, slots=True, eq=False)
+class ColorPatch:
+    """Something in front of the still scene, on a window (rows, columns) of the image.
+
+    The window begins at even pixels. `image` and `covered` have samples × samples points a pixel: BGR, black
+    where the still scene shows, and 1 where it does not.
+    """
+
+    window: tuple[slice, slice]
+    image: ImageU8
+    covered: Plane
+
+
 class BayerSensor:
     """Bayer frames of one camera in front of one still scene."""
 
@@ -25,15 +42,33 @@ class BayerSensor:
         """`scene`: BGR with samples × samples points a pixel; `exposure`: factor on the automatic one."""
         image = _through_lens(scene, samples)
         gain = np.clip(_MEAN_LEVEL / max(float(image.mean()), 1.0), *_GAIN_LIMITS) * exposure
-        levels = mosaic(image) * gain * _vignetting(image.shape[:2])
-        self._base = np.asarray(np.minimum(levels, 255), dtype=np.float32)
-        self._sigma = np.sqrt(_PHOTON_VARIANCE * self._base + _READ_SIGMA**2, dtype=np.float32)
+        self._samples = samples
+        self._gain = np.asarray(gain * _vignetting(image.shape[:2]))
+        self._base = np.asarray(np.minimum(mosaic(image) * self._gain, 255), dtype=np.float32)
+        self._sigma = _noise_sigma(self._base)
         self._bank = NoiseBank(rng, image.shape[:2], correlated=False)
 
-    def frame(self, rng: np.random.Generator) -> ImageU8:
-        """One frame, 8 bit GRBG."""
-        noise = cv2.multiply(self._sigma, self._bank.draw(rng))
-        return np.asarray(cv2.add(self._base, noise, dtype=cv2.CV_8U), dtype=np.uint8)
+    def frame(
+        self, rng: np.random.Generator, light: Plane | None = None, patches: Sequence[ColorPatch] = ()
+    ) -> ImageU8:
+        """One frame, 8 bit GRBG; `light` (rows, columns): share of the scene's light that is left.
+
+        `patches`: what stands in front of the scene, farthest first.
+        """
+        base, sigma = self._base, self._sigma
+        if light is not None or patches:
+            base = base.copy() if light is None else np.asarray(base * light, dtype=np.float32)
+            for patch in patches:
+                base[patch.window] = self._covered(base[patch.window], patch)
+            sigma = _noise_sigma(base)
+        noise = cv2.multiply(sigma, self._bank.draw(rng))
+        return np.asarray(cv2.add(base, noise, dtype=cv2.CV_8U), dtype=np.uint8)
+
+    def _covered(self, base: Plane, patch: ColorPatch) -> Plane:
+        """The base of a window with the patch in front: the lens mixes both at the rim."""
+        image = mosaic(_through_lens(patch.image, self._samples)) * self._gain[patch.window]
+        share = _through_lens(patch.covered, self._samples)
+        return np.asarray(np.minimum(base * (1 - share) + image, 255), dtype=np.float32)
 
 
 def mosaic(image: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
@@ -45,7 +80,11 @@ def mosaic(image: npt.NDArray[np.float32]) -> npt.NDArray[np.float32]:
     return out
 
 
-def _through_lens(scene: ImageU8, samples: int) -> npt.NDArray[np.float32]:
+def _noise_sigma(base: Plane) -> Plane:
+    return np.asarray(np.sqrt(_PHOTON_VARIANCE * base + _READ_SIGMA**2), dtype=np.float32)
+
+
+def _through_lens(scene: ImageU8 | Plane, samples: int) -> npt.NDArray[np.float32]:
     """The supersampled scene blurred by the lens and summed over the pixels' areas."""
     soft = cv2.GaussianBlur(scene, (0, 0), _BLUR_PX * samples)
     size = (scene.shape[1] // samples, scene.shape[0] // samples)

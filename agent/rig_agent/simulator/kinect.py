@@ -1,13 +1,16 @@
 """One virtual Kinect of the ring: its factory model, its true pose, its frames."""
 
+from collections.abc import Sequence
 from functools import cached_property
 
 import numpy as np
 import numpy.typing as npt
 
 from rig_agent.simulator.color_sensor import BayerSensor
+from rig_agent.simulator.foreground import PROJECTOR_BASELINE_M, LampLight, color_patches, depth_patches
 from rig_agent.simulator.kinect_noise import CleanDepth, DisparitySensor, Mask
 from rig_agent.simulator.lens import Plane, RayGrid, ray_grid
+from rig_agent.simulator.people import People, Standing
 from rig_agent.simulator.renderer import Hits, cast, cosine_of_incidence, shade
 from rig_agent.simulator.scene import Scene
 from rig_agent.simulator.settings import SimulatorSettings
@@ -22,7 +25,6 @@ Images = tuple[ImageU8, ImageU16 | None]
 COLOR_SAMPLES = 2
 """Rays a pixel and axis of the colour image."""
 
-_PROJECTOR_BASELINE_M = 0.075  # the projector sits to the right of the depth camera
 _PROJECTOR = Intrinsics(580.0, 580.0, 340.0, 260.0, 680, 520)
 _SHADOW_TOLERANCE = 0.02  # relative depth by which a blocker must be nearer than what it shades
 _PROJECTOR_REACH = (0.57, 0.43)  # tangents of half its field
@@ -33,24 +35,24 @@ class View:
 
     def __init__(self, scene: Scene, unit: VirtualUnit, T_rig_camera: Pose) -> None:
         """`T_rig_camera` is the pose of the colour camera."""
-        self._scene, self._unit = scene, unit
+        self.scene, self.unit = scene, unit
         self.T_room_color = np.asarray(scene.T_room_rig @ T_rig_camera)
         self.T_room_depth = np.asarray(self.T_room_color @ unit.T_color_depth)
 
     def color(self) -> ImageU8:
         """BGR with COLOR_SAMPLES² points a pixel, without noise."""
-        rays = ray_grid(self._unit.color, COLOR_SAMPLES)
-        hits = cast(self._scene.surfaces, self.T_room_color, rays)
-        return shade(self._scene, hits, self.T_room_color, rays)
+        rays = ray_grid(self.unit.color, COLOR_SAMPLES)
+        hits = cast(self.scene.surfaces, self.T_room_color, rays)
+        return shade(self.scene, hits, self.T_room_color, rays)
 
     def color_z_m(self) -> Plane:
         """True depth (rows, columns) at the colour camera's pixels, 0 where nothing is."""
-        return _depth(cast(self._scene.surfaces, self.T_room_color, ray_grid(self._unit.color)))
+        return _depth(cast(self.scene.surfaces, self.T_room_color, ray_grid(self.unit.color)))
 
     def depth(self, projectors: list[Pose]) -> CleanDepth:
         """True depth and what keeps a Kinect from measuring it; `projectors`: poses of the neighbours'."""
-        rays = ray_grid(self._unit.depth)
-        hits = cast(self._scene.surfaces, self.T_room_depth, rays)
+        rays = ray_grid(self.unit.depth)
+        hits = cast(self.scene.surfaces, self.T_room_depth, rays)
         z_m = _depth(hits)
         points = np.stack([rays.x * z_m, rays.y * z_m, z_m], axis=-1).reshape(-1, 3).astype(np.float64)
         interfered = np.zeros(len(points), bool)
@@ -58,7 +60,7 @@ class View:
             interfered |= _lit(transform_points(inverse(T_room_projector) @ self.T_room_depth, points))
         return CleanDepth(
             z_m,
-            cosine_of_incidence(self._scene.surfaces, hits, self.T_room_depth, rays),
+            cosine_of_incidence(self.scene.surfaces, hits, self.T_room_depth, rays),
             self._shadow(rays, z_m),
             interfered.reshape(z_m.shape),
         )
@@ -66,15 +68,47 @@ class View:
     def _shadow(self, rays: RayGrid, z_m: Plane) -> Mask:
         """Pixels whose surface the projector does not reach: something is nearer to it on the same ray."""
         T_room_projector = projector_pose(self.T_room_depth)
-        lit_z = _depth(cast(self._scene.surfaces, T_room_projector, ray_grid(_PROJECTOR)))
+        lit_z = _depth(cast(self.scene.surfaces, T_room_projector, ray_grid(_PROJECTOR)))
         z = np.maximum(z_m, 1e-3)
-        column = _PROJECTOR.fx * (rays.x - _PROJECTOR_BASELINE_M / z) + _PROJECTOR.cx
+        column = _PROJECTOR.fx * (rays.x - PROJECTOR_BASELINE_M / z) + _PROJECTOR.cx
         row = _PROJECTOR.fy * rays.y + _PROJECTOR.cy
         nearest = lit_z[
             np.clip(np.rint(row), 0, _PROJECTOR.height - 1).astype(int),
             np.clip(np.rint(column), 0, _PROJECTOR.width - 1).astype(int),
         ]
         return np.asarray(nearest < z_m * (1 - _SHADOW_TOLERANCE))
+
+
+class Sensors:
+    """Both sensors of a unit at one place in the still room, and what people change in their images."""
+
+    def __init__(self, view: View, color: BayerSensor, depth: DisparitySensor | None) -> None:
+        self.view, self.color, self.depth = view, color, depth
+
+    def images(self, rng: np.random.Generator, people: Sequence[Standing] = ()) -> Images:
+        """One frame of each; None where the unit measures no depth."""
+        if not people:
+            return self.color.frame(rng), None if self.depth is None else self.depth.frame(rng)
+        view = self.view
+        covers = color_patches(view.scene, people, view.T_room_color, self._color_rays, COLOR_SAMPLES)
+        color = self.color.frame(rng, self._lamp.left_by(people), covers)
+        if self.depth is None:
+            return color, None
+        projector = projector_pose(view.T_room_depth)
+        patches = depth_patches(self.depth.clean, people, view.T_room_depth, self._depth_rays, projector)
+        return color, self.depth.frame(rng, patches)
+
+    @cached_property
+    def _color_rays(self) -> RayGrid:
+        return ray_grid(self.view.unit.color, COLOR_SAMPLES)
+
+    @cached_property
+    def _depth_rays(self) -> RayGrid:
+        return ray_grid(self.view.unit.depth)
+
+    @cached_property
+    def _lamp(self) -> LampLight:
+        return LampLight.on(self.view.scene, self.view.unit.color, self.view.T_room_color)
 
 
 class VirtualKinect:
@@ -84,7 +118,8 @@ class VirtualKinect:
         """Nothing is rendered before a frame is asked for."""
         self.id = camera
         self._settings, self._scene = settings, scene
-        self._rendered: dict[bool, tuple[BayerSensor, DisparitySensor | None]] = {}
+        self._people = People(settings, scene)
+        self._rendered: dict[bool, Sensors] = {}
         self._loop: dict[tuple[bool, int], Images] = {}
 
     @cached_property
@@ -127,7 +162,7 @@ class VirtualKinect:
         return View(self._scene, self.unit, self.T_rig_camera_at(frame))
 
     def frame(self, k: int) -> RgbdFrame:
-        """Frame k, stamped as if frame 0 was taken at `phase_ns`; noise repeats after `frames_rendered`."""
+        """Frame k, stamped as if frame 0 was taken at `phase_ns`; all repeats after `frames_rendered`."""
         loop = self._settings.frames_rendered
         images = self._looped(k, k % loop) if loop else self._images(k, k)
         return RgbdFrame(
@@ -138,32 +173,33 @@ class VirtualKinect:
             raw=images[1],
         )
 
-    def _looped(self, k: int, noise_index: int) -> Images:
-        key = (self._knocked(k), noise_index)
+    def _looped(self, k: int, moment: int) -> Images:
+        key = (self._knocked(k), moment)
         if key not in self._loop:
-            self._loop[key] = self._images(k, noise_index)
+            self._loop[key] = self._images(k, moment)
         return self._loop[key]
 
-    def _images(self, k: int, noise_index: int) -> Images:
-        color, depth = self._sensors(k)
-        rng = generator(self._settings.seed, Stream.FRAME, self.id, noise_index)
-        return color.frame(rng), None if depth is None else depth.frame(rng)
+    def _images(self, k: int, moment: int) -> Images:
+        """What is seen from the place of frame k, with the people and the noise of the frame `moment`."""
+        rng = generator(self._settings.seed, Stream.FRAME, self.id, moment)
+        time_ns = self.phase_ns + moment * self.frame_interval_ns
+        return self._sensors(k).images(rng, self._people.at(time_ns / 1e9))
 
-    def _sensors(self, k: int) -> tuple[BayerSensor, DisparitySensor | None]:
+    def _sensors(self, k: int) -> Sensors:
         """Both sensors in front of the scene as it is seen at frame k; rendered once a place."""
         knocked = self._knocked(k)
         if knocked not in self._rendered:
             self._rendered[knocked] = self._render(self.view(k), k)
         return self._rendered[knocked]
 
-    def _render(self, view: View, k: int) -> tuple[BayerSensor, DisparitySensor | None]:
+    def _render(self, view: View, k: int) -> Sensors:
         settings = self._settings
         rng = generator(settings.seed, Stream.FIXED_NOISE, self.id)
         color = BayerSensor(rng, view.color(), COLOR_SAMPLES, self.unit.exposure)
         if settings.depthless_camera == self.id:
-            return color, None
+            return Sensors(view, color, None)
         clean = view.depth(self._neighbouring_projectors(k))
-        return color, DisparitySensor(rng, clean, self.unit.raw_model, settings)
+        return Sensors(view, color, DisparitySensor(rng, clean, self.unit.raw_model, settings))
 
     def _knocked(self, k: int) -> bool:
         knock = self._settings.knock
@@ -184,7 +220,7 @@ class VirtualKinect:
 def projector_pose(T_room_depth: Pose) -> Pose:
     """T_room_projector of the unit whose depth camera is at T_room_depth."""
     T = T_room_depth.copy()
-    T[:3, 3] += _PROJECTOR_BASELINE_M * T[:3, 0]
+    T[:3, 3] += PROJECTOR_BASELINE_M * T[:3, 0]
     return T
 
 

@@ -3,6 +3,7 @@
 What stays the same over frames is made once; a frame then costs a few passes over the image.
 """
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from statistics import NormalDist
 
@@ -21,6 +22,7 @@ Mask = npt.NDArray[np.bool_]
 BLIND_COLUMNS = 8  # right-hand columns that the correlation window never covers
 MIN_Z_M, MAX_Z_M = 0.5, 5.0
 STEEPEST_DEG = 80.0
+_LEAST_COSINE = np.cos(np.deg2rad(STEEPEST_DEG))
 
 _ROUNDING_VARIANCE = 1 / 12  # of a uniform step of one LSB
 _EDGE_JITTER_PX = 0.8  # lateral noise of Nguyen, Izadi & Lovell 2012
@@ -28,6 +30,7 @@ _EDGE_STEP = 0.03  # relative change of 1/z over five pixels that only an edge m
 # How distortion decays with disparity: Herrera, Kannala & Heikkila 2012.
 _DECAY_0, _DECAY_1 = 1.791, 0.002926
 _DISTORTION_QUOTED_AT_M = 1.5
+_UNITS_DIFFER = 0.2  # in how much they distort, natural logarithm
 _FROZEN_HOLES = 0.7  # interference flickers at the rims of holes that mostly stay
 
 
@@ -39,6 +42,14 @@ class CleanDepth:
     cosine: Plane
     shadow: Mask
     interfered: Mask
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class DepthPatch:
+    """What is seen on a window (rows, columns) of the image instead of the still scene."""
+
+    window: tuple[slice, slice]
+    clean: CleanDepth
 
 
 class DisparitySensor:
@@ -53,34 +64,45 @@ class DisparitySensor:
     ) -> None:
         """Draw the unit's distortion and frozen noise; `raw_model` is its true one."""
         shape = clean.z_m.shape[0], clean.z_m.shape[1]
-        jitter = correlated_noise(rng, shape), correlated_noise(rng, shape)
-        z_m = np.clip(_with_ragged_edges(clean.z_m, jitter), 0.1, 50)
-        ideal = raw_model.offset - raw_model.numerator_m / z_m
-        distorted = ideal + smooth_field(rng, shape) * distortion_amplitude(settings, raw_model, ideal, rng)
-        sigma = noise_sigma_lsb(settings, raw_model, z_m, clean.cosine)
-        frozen = np.sqrt(settings.frozen_noise) * correlated_noise(rng, shape)
-        self._base = np.asarray(distorted + sigma * frozen, dtype=np.float32)
-        self._fresh_sigma = np.asarray(sigma * np.sqrt(1 - settings.frozen_noise), dtype=np.float32)
+        self.clean = clean
+        self._raw_model, self._settings = raw_model, settings
+        self._jitter = correlated_noise(rng, shape), correlated_noise(rng, shape)
+        self._distortion = smooth_field(rng, shape)
+        self._distortion_scale = float(np.exp(_UNITS_DIFFER * rng.standard_normal()))
+        self._frozen = np.sqrt(settings.frozen_noise) * correlated_noise(rng, shape)
+        self._base, self._fresh_sigma, self._invalid = self._measured(DepthPatch(np.s_[:, :], clean))
         self._bank = NoiseBank(rng, shape, correlated=True)
-        self._invalid = (
-            clean.shadow
-            | (z_m < MIN_Z_M)
-            | (z_m > MAX_Z_M)
-            | (clean.cosine < np.cos(np.deg2rad(STEEPEST_DEG)))
-        )
-        self._invalid[:, -BLIND_COLUMNS:] = True
         self._holes = _hole_field(rng, clean.interfered, settings.interference)
 
-    def frame(self, rng: np.random.Generator) -> ImageU16:
-        """One frame, 11 bit, 2047 = none."""
-        noise = self._bank.draw(rng)
-        measured = cv2.add(self._base, cv2.multiply(self._fresh_sigma, noise), dtype=cv2.CV_16U)
+    def frame(self, rng: np.random.Generator, patches: Sequence[DepthPatch] = ()) -> ImageU16:
+        """One frame, 11 bit, 2047 = none; `patches`: where something stands in front of the scene."""
+        base, sigma, invalid = self._base, self._fresh_sigma, self._invalid
+        if patches:
+            base, sigma, invalid = base.copy(), sigma.copy(), invalid.copy()
+        for patch in patches:
+            base[patch.window], sigma[patch.window], invalid[patch.window] = self._measured(patch)
+        measured = cv2.add(base, cv2.multiply(sigma, self._bank.draw(rng)), dtype=cv2.CV_16U)
         raw: ImageU16 = np.asarray(measured, dtype=np.uint16)
-        raw[self._invalid] = NO_DISPARITY
+        raw[invalid] = NO_DISPARITY
+        raw[:, -BLIND_COLUMNS:] = NO_DISPARITY
         if self._holes is not None:
             flicker = self._bank.draw(rng)
             raw[cv2.scaleAdd(flicker, np.sqrt(1 - _FROZEN_HOLES), self._holes) > 0] = NO_DISPARITY
         return raw
+
+    def _measured(self, patch: DepthPatch) -> tuple[Plane, Plane, Mask]:
+        """On a window: disparity without fresh noise, the sigma of that, and where nothing is measured."""
+        window, clean, settings, model = patch.window, patch.clean, self._settings, self._raw_model
+        z_m = np.clip(
+            _with_ragged_edges(clean.z_m, (self._jitter[0][window], self._jitter[1][window])), 0.1, 50
+        )
+        ideal = model.offset - model.numerator_m / z_m
+        amplitude = distortion_amplitude(settings, model, ideal) * self._distortion_scale
+        sigma = noise_sigma_lsb(settings, model, z_m, clean.cosine)
+        base = ideal + self._distortion[window] * amplitude + sigma * self._frozen[window]
+        invalid = clean.shadow | (z_m < MIN_Z_M) | (z_m > MAX_Z_M) | (clean.cosine < _LEAST_COSINE)
+        fresh_sigma = np.asarray(sigma * np.sqrt(1 - settings.frozen_noise), dtype=np.float32)
+        return np.asarray(base, dtype=np.float32), fresh_sigma, invalid
 
 
 def noise_sigma_lsb(
@@ -107,17 +129,15 @@ def smooth_field(rng: np.random.Generator, shape: tuple[int, int]) -> Plane:
     return np.asarray(cv2.resize(field.astype(np.float32), shape[::-1], interpolation=cv2.INTER_CUBIC))
 
 
-def distortion_amplitude(
-    settings: SimulatorSettings, raw_model: RawDepthModel, disparity: Plane, rng: np.random.Generator
-) -> Plane:
-    """Peak to peak of a unit's distortion, LSB, at each pixel's disparity; units differ by a fifth."""
+def distortion_amplitude(settings: SimulatorSettings, raw_model: RawDepthModel, disparity: Plane) -> Plane:
+    """Peak to peak of a typical unit's distortion, LSB, at each pixel's disparity."""
 
     def decay(d: Plane | float) -> npt.NDArray[np.floating]:
         return np.asarray(np.exp(_DECAY_0 - _DECAY_1 * d))
 
     lsb_per_m = raw_model.numerator_m / _DISTORTION_QUOTED_AT_M**2
     quoted_disparity = raw_model.offset - raw_model.numerator_m / _DISTORTION_QUOTED_AT_M
-    quoted_lsb = settings.depth_distortion_mm / 1000 * lsb_per_m * np.exp(0.2 * rng.standard_normal())
+    quoted_lsb = settings.depth_distortion_mm / 1000 * lsb_per_m
     return np.asarray(quoted_lsb * decay(disparity) / decay(quoted_disparity), dtype=np.float32)
 
 

@@ -75,10 +75,15 @@ def _paint(image: ImageU8, candidate: "_Candidate", scene: Scene, hits: Hits, ra
 
 def cosine_of_incidence(surfaces: Sequence[Surface], hits: Hits, T_room_camera: Pose, rays: RayGrid) -> Plane:
     """Cosine (rows, columns) between ray and normal; 0 where nothing is hit."""
-    normals = np.array([surface.normal for surface in surfaces] + [np.zeros(3)]) @ T_room_camera[:3, :3]
+    normals = surface_normals(surfaces) @ T_room_camera[:3, :3]
     nx, ny, nz = (normals[:, axis].astype(np.float32)[hits.surface] for axis in range(3))
     length = np.sqrt(rays.x**2 + rays.y**2 + 1)
     return np.asarray(np.abs(nx * rays.x + ny * rays.y + nz) / length, dtype=np.float32)
+
+
+def surface_normals(surfaces: Sequence[Surface]) -> Matrix:
+    """Normals (N+1,3) in the room; the last, which NOTHING indexes, is zero."""
+    return np.array([surface.normal for surface in surfaces] + [np.zeros(3)])
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -13,7 +13,9 @@ from rig_protocol.poses import Pose
 
 Vector = npt.NDArray[np.float64]
 
-_KEEP_OUT_M = 0.95  # a Kinect measures from 0.5 m on, and people must reach the rig
+KEEP_OUT_M = 0.95
+"""Half of the square around the rig without furniture: a Kinect measures from 0.5 m on, and people pass."""
+
 _WALL_GAP_M = 0.03  # furniture stands off the wall, so that patterns do not pierce it
 _CORNER_M = 0.55  # half of the widest tall piece: nearer to a corner it would stand beside the overlap
 _PATTERN_TEXEL_M = 0.002
@@ -130,7 +132,7 @@ def _furniture(
     rig: Vector,
 ) -> list[Surface]:
     """Tall pieces in front of the blocked overlaps, low ones wherever they fit."""
-    taken: list[tuple[Vector, Vector]] = [(rig[:2] - _KEEP_OUT_M, rig[:2] + _KEEP_OUT_M)]
+    taken: list[tuple[Vector, Vector]] = [(rig[:2] - KEEP_OUT_M, rig[:2] + KEEP_OUT_M)]
     surfaces: list[Surface] = []
     blocked = 0
     for target in _overlaps_to_block(rng, walls, targets):

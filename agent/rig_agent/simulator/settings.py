@@ -53,6 +53,9 @@ class SimulatorSettings(Settings):
     screened_overlap: int | None = Field(None, ge=0)
     """Index of an overlap with a plain screen so near that its two cameras see nothing in common."""
 
+    people: int = Field(0, ge=0, le=8)
+    """How many people walk around the rig, all the time."""
+
     mounting_deg: float = Field(1.0, ge=0)
     """Mounting error, one sigma an axis."""
     mounting_m: float = Field(0.005, ge=0)

@@ -16,6 +16,7 @@ class Stream(IntEnum):
     FRAME = 7006
     PHASE = 7007
     KNOCK = 7008
+    PEOPLE = 7009
 
 
 def generator(seed: int, stream: Stream, *key: int) -> np.random.Generator:

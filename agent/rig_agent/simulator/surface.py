@@ -14,6 +14,7 @@ from rig_protocol.poses import Pose
 Vector = npt.NDArray[np.float64]
 
 _LIGHT_GRID = 12  # light varies slowly: this many samples along a surface, interpolated
+_AMBIENT = 0.45  # what walls throw back
 _UP = np.array([0.0, 0.0, 1.0])
 
 
@@ -56,13 +57,9 @@ class Surface:
         )
 
     def _irradiance(self, light: Vector) -> npt.NDArray[np.float32]:
-        """Lambert's law for one lamp, plus what the walls throw back."""
         steps = (np.arange(_LIGHT_GRID) + 0.5) / _LIGHT_GRID
         points = self.corner + steps[:, None, None] * self.edge_v + steps[None, :, None] * self.edge_u
-        to_light = light - points
-        distance = np.linalg.norm(to_light, axis=-1)
-        cosine = np.clip(to_light @ self.normal / distance, 0, 1)
-        return np.asarray(0.45 + 0.9 * cosine / (1 + (distance / 1.8) ** 2), dtype=np.float32)
+        return np.asarray(_AMBIENT + lamp_light(points, self.normal, light), dtype=np.float32)
 
 
 @dataclass(frozen=True, slots=True)
@@ -92,3 +89,16 @@ class Box:
                 corner = centre + (n - u - v) / 2
                 faces.append(Surface(R @ corner + origin, R @ u, R @ v, self.material))
         return faces
+
+
+def lamp_light(points: Vector, normals: Vector, light: Vector) -> Vector:
+    """Lambert's law for one lamp at `light`: what points (..., 3) with normals (..., 3) get of it."""
+    to_light = light - points
+    distance = np.linalg.norm(to_light, axis=-1)
+    cosine = np.clip((to_light * normals).sum(axis=-1) / np.maximum(distance, 1e-6), 0, 1)
+    return np.asarray(0.9 * cosine / (1 + (distance / 1.8) ** 2))
+
+
+def left_in_shadow(points: Vector, normals: Vector, light: Vector) -> Vector:
+    """Share of the light (...,) at points that stays when something stands before the lamp."""
+    return np.asarray(_AMBIENT / (_AMBIENT + lamp_light(points, normals, light)))

@@ -114,3 +114,14 @@ def test_the_text_satisfies_the_strict_parser_and_every_metric_explains_itself()
     assert samples(parsed) == samples(list(families(full_status())))
     assert all(metric.documentation.endswith(".") for metric in parsed)
     assert generate_latest(registry)
+
+
+def test_a_moved_camera_is_an_alarm_with_its_size(told: Samples) -> None:
+    assert told["rig_camera_moved", (("camera", "cam00"),)] == 0
+    assert told["rig_camera_moved", (("camera", "cam01"),)] == 1
+    assert told["rig_camera_shift_mm", (("camera", "cam01"),)] == 6.25
+    assert told["rig_camera_shift_deg", (("camera", "cam01"),)] == 0.52
+    assert told["rig_camera_watched", (("camera", "cam00"),)] == 1
+    assert told["rig_overlap_residual_mm", (("camera", "cam00"), ("other", "cam01"))] == 7.5
+    assert told["rig_drift_looks_total", (("outcome", "looked"),)] == 61
+    assert told["rig_drift_looks_total", (("outcome", "busy"),)] == 41

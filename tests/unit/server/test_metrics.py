@@ -204,3 +204,14 @@ def test_on_a_terminal_the_table_is_drawn_and_stays() -> None:
     with LiveDisplay(console, "rig-server") as display:
         display.update(busy_status())
     assert "long-name-11" in console.file.getvalue()  # type: ignore[attr-defined]
+
+
+def test_a_moved_camera_stands_out_in_the_table_and_in_the_line() -> None:
+    alarm = "cam01 has moved by 0.52° ± 0.01° and 6.2 ± 0.3 mm"
+    console = Console(width=200, record=True, color_system="standard", file=io.StringIO())
+    console.print(status_table(full_status(), "rig-server"))
+    styled = console.export_text(styles=True, clear=False)
+    (line,) = (line for line in styled.splitlines() if alarm in line)
+    assert "\x1b[1;31m" in line  # bold and red
+    assert alarm in status_line(full_status())
+    assert "has moved" not in status_line(replace(full_status(), drift=None))

@@ -131,7 +131,7 @@ def test_distortion_is_smooth_and_as_large_as_on_a_measured_unit() -> None:
             rng = np.random.default_rng(seed)
             field = smooth_field(rng, SHAPE)
             disparity = np.full(SHAPE, MODEL.offset - MODEL.numerator_m / z_m, np.float32)
-            lsb = field * distortion_amplitude(settings, MODEL, disparity, rng)
+            lsb = field * distortion_amplitude(settings, MODEL, disparity)
             spans.append(float(np.ptp(lsb)) * z_m**2 / MODEL.numerator_m * 1000)
             assert np.abs(np.diff(field, axis=1)).max() < 0.02
     assert np.median(spans_mm[1.5]) == pytest.approx(34, rel=0.2)
