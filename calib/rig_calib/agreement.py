@@ -40,6 +40,7 @@ def _agrees(
 
 @compiled()
 def agreement(
+    limits: Limits,
     poses: Array,
     camera_i: Array,
     pixels_i: Array,
@@ -47,7 +48,6 @@ def agreement(
     camera_j: Array,
     pixels_j: Array,
     points_j: Array,
-    limits: Limits,
 ) -> Mask:
     """(B,N) whether poses T_i_j (B,4,4) explain N matches by every measurement they have.
 
@@ -66,11 +66,8 @@ def agreement(
                 Z = poses[b, 2, 0] * x + poses[b, 2, 1] * y + poses[b, 2, 2] * z + poses[b, 2, 3]
                 agrees = _agrees(camera_i, X, Y, Z, pixels_i[n, 0], pixels_i[n, 1], z_i, limits)
             if agrees and not np.isnan(z_i):
-                x, y, z = (
-                    points_i[n, 0] - poses[b, 0, 3],
-                    points_i[n, 1] - poses[b, 1, 3],
-                    z_i - poses[b, 2, 3],
-                )
+                x, y = points_i[n, 0] - poses[b, 0, 3], points_i[n, 1] - poses[b, 1, 3]
+                z = z_i - poses[b, 2, 3]
                 X = poses[b, 0, 0] * x + poses[b, 1, 0] * y + poses[b, 2, 0] * z
                 Y = poses[b, 0, 1] * x + poses[b, 1, 1] * y + poses[b, 2, 1] * z
                 Z = poses[b, 0, 2] * x + poses[b, 1, 2] * y + poses[b, 2, 2] * z

@@ -144,7 +144,7 @@ def _agreeing_all(poses: Array, i: Side, j: Side, tolerance: Tolerance) -> Mask:
     camera_i, camera_j = (np.array([intrinsics_row(side.color)]) for side in (i, j))
     limits = Limits(tolerance.pixels**2, tolerance.inverse_depth, tolerance.depth_scale)
     arrays = map(np.ascontiguousarray, (poses, camera_i, i.pixels, i.points, camera_j, j.pixels, j.points))
-    return agreement(*arrays, limits)
+    return agreement(limits, *arrays)
 
 
 def _polish(pose: Pose, i: Side, j: Side, tolerance: Tolerance, min_inliers: int) -> tuple[Pose, Mask] | None:
