@@ -9,16 +9,17 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from rig_calib.projection import project
+from rig_calib.agreement import Limits, agreement
+from rig_calib.observation_model import intrinsics_row
 from rig_protocol.camera import Intrinsics
-from rig_protocol.poses import Pose, hat, inverse, se3_exp, transform_points
+from rig_protocol.poses import Pose, hat, se3_exp, transform_points
 
 Array = npt.NDArray[np.float64]
 Mask = npt.NDArray[np.bool_]
 
-# Hypotheses scored at once: few at first, since most matches of a good pair are true, then twice as many
-# every time.
-_FIRST_BATCH, _LARGEST_BATCH = 32, 256
+# Hypotheses scored at once: fewer at first, since most matches of a good pair are true. More than one clean
+# sample is wanted: the best of some dozens starts nearer.
+_FIRST_BATCH, _LARGEST_BATCH = 128, 256
 _MAX_TRIALS = 4096
 _CONFIDENCE = 0.9999
 _POLISH_ROUNDS = 4
@@ -140,26 +141,10 @@ def _plausible(p_i: Array, p_j: Array, tolerance: Tolerance) -> Mask:
 
 def _agreeing_all(poses: Array, i: Side, j: Side, tolerance: Tolerance) -> Mask:
     """(B,N) for poses T_i_j (B,4,4)."""
-    inverses = np.stack([inverse(T) for T in poses])
-    good_i, depth_ok_i = _seen_alike(poses, j, i, tolerance)
-    good_j, depth_ok_j = _seen_alike(inverses, i, j, tolerance)
-    return (good_i | ~j.known) & (good_j | ~i.known) & depth_ok_i & depth_ok_j & (i.known | j.known)
-
-
-def _seen_alike(poses: Array, source: Side, target: Side, tolerance: Tolerance) -> tuple[Mask, Mask]:
-    """(B,N): which moved source points fall on the target's pixels; which are as deep as its points."""
-    points = (
-        np.nan_to_num(source.points, nan=1.0) @ poses[:, :3, :3].transpose(0, 2, 1) + poses[:, None, :3, 3]
-    )
-    ahead = points[..., 2] > 0.05
-    flat = np.where(ahead[..., None], points, 1.0).reshape(-1, 3)
-    pixels = project(target.color, flat).reshape(*points.shape[:2], 2)
-    near = ((pixels - target.pixels) ** 2).sum(axis=2) < tolerance.pixels**2
-    with np.errstate(divide="ignore"):  # points behind the camera are refused by `ahead`
-        inverse_here, inverse_there = 1.0 / points[..., 2], 1.0 / target.points[:, 2]
-    allowed = tolerance.inverse_depth + tolerance.depth_scale * inverse_there
-    as_deep = ~(np.abs(inverse_here - inverse_there) > allowed) | ~source.known
-    return np.asarray(near & ahead), np.asarray(as_deep)
+    camera_i, camera_j = (np.array([intrinsics_row(side.color)]) for side in (i, j))
+    limits = Limits(tolerance.pixels**2, tolerance.inverse_depth, tolerance.depth_scale)
+    arrays = map(np.ascontiguousarray, (poses, camera_i, i.pixels, i.points, camera_j, j.pixels, j.points))
+    return agreement(limits, *arrays)
 
 
 def _polish(pose: Pose, i: Side, j: Side, tolerance: Tolerance, min_inliers: int) -> tuple[Pose, Mask] | None:
