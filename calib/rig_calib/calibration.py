@@ -14,7 +14,7 @@ import numpy as np
 from rig_calib import gate
 from rig_calib.alignment import align_frames
 from rig_calib.consistency import ConsistentGraph, consistent_graph, pose_edge
-from rig_calib.edges import TOLERANCE, Edge, measure_edge
+from rig_calib.edges import TOLERANCE, Edge, estimate_edge, measure_edge
 from rig_calib.evidence import EdgeEvidence
 from rig_calib.loops import closing_cycle
 from rig_calib.matching import Matches, flann_matches, mutual_matches
@@ -213,7 +213,7 @@ def _solve_jointly(
         if noise is AT_REST and _largest_shift_px(before, rig.poses, regions) < _SETTLED_PX:
             break
     rig = adjust_rig(refined.cameras, matches, rig.poses, ring, settings, rig.observed_noise())
-    edges = [_refined_edge(edge, matches) for edge in graph.edges]
+    edges = [_refined_edge(edge, refined, matches, rig, settings) for edge in graph.edges]
     better = {c: corrected(camera, rig.corrections.get(c)) for c, camera in refined.cameras.items()}
     return _Solution(better, edges, rig.poses, rig)
 
@@ -258,10 +258,21 @@ def _largest_shift_px(before: Mapping[int, Pose], after: Mapping[int, Pose], pai
     return max(shifts)
 
 
-def _refined_edge(edge: Edge, matches: Mapping[Pair, Matches]) -> Edge:
-    """The edge with its patches for matches."""
+def _refined_edge(
+    edge: Edge,
+    refined: RefinedRig,
+    matches: Mapping[Pair, Matches],
+    rig: AdjustedRig,
+    settings: CalibrationSettings,
+) -> Edge:
+    """What the pair's patches alone say; without any it keeps why its keypoints gave nothing."""
+    i, j = edge.pair
     rows = matches.get(edge.pair, _NO_MATCHES)
-    return replace(edge, matches=rows, inlier=np.ones(len(rows), dtype=bool))
+    if not len(rows):
+        reason = edge.reason or "nothing that both cameras recognise was left when depth was corrected"
+        return replace(edge, matches=_NO_MATCHES, inlier=np.zeros(0, dtype=bool), reason=reason)
+    T_i_j = inverse(rig.poses[i]) @ rig.poses[j]
+    return estimate_edge(refined.cameras[i], refined.cameras[j], rows, T_i_j, settings)
 
 
 def _prediction_px(rig: AdjustedRig, pairs: Iterable[Pair]) -> dict[Pair, float]:

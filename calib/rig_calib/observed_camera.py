@@ -49,16 +49,12 @@ class ObservedCamera:
     @property
     def depth_frames(self) -> int:
         """How many depth images were averaged."""
-        return len(self.view.raw) or len(self.view.depth_mm)
+        return max(len(self.view.raw), len(self.view.depth_mm), 1)
 
 
 def missing_images(view: CameraView) -> str | None:
     """Why a view cannot be calibrated, or None when it can."""
-    if not view.color:
-        return "no colour image"
-    if not view.raw and not view.depth_mm:
-        return "no depth image"
-    return None
+    return None if view.color else "no colour image"
 
 
 def observe(view: CameraView, region: Region, max_keypoints: int, pixel_sigma: float) -> ObservedCamera:
@@ -68,9 +64,14 @@ def observe(view: CameraView, region: Region, max_keypoints: int, pixel_sigma: f
     """
     grid = depth_grid(view.model, view.depth_frame)
     frames = len(view.raw) or len(view.depth_mm)
-    disparity = mean_disparity([disparity_image(view, frame) for frame in range(frames)])
+    images = [disparity_image(view, frame) for frame in range(frames)]
+    disparity = mean_disparity(images or [_no_disparity(grid)])
     grey = mean_grey(view.color)
     keypoints = detect(grey, region, max_keypoints, pixel_sigma)
-    depth = keypoint_depth(view.model.color, grid, disparity, keypoints.pixels, frames)
+    depth = keypoint_depth(view.model.color, grid, disparity, keypoints.pixels, max(frames, 1))
     points = keypoint_points(view.model.color, grid, keypoints.pixels, depth)
     return ObservedCamera(view, grid, smoothed(grey), disparity, keypoints, depth, points)
+
+
+def _no_disparity(grid: DepthGrid) -> Array:
+    return np.full((grid.intrinsics.height, grid.intrinsics.width), np.nan)

@@ -41,3 +41,7 @@ class CalibrationSettings(Settings):
     """An edge whose weakest direction is known less well than this is weak and not used."""
     max_edge_sigma_m: Positive = 0.06
     """As `max_edge_sigma_deg`, for translation."""
+    max_pair_sigma_deg: Positive = 0.3
+    """A pair that should share a view and is known less well than this fails the gate."""
+    max_pair_sigma_m: Positive = 0.015
+    """As `max_pair_sigma_deg`, for translation."""
