@@ -41,7 +41,7 @@ _OVERLAP_MARGIN_DEG = 7.0
 # Rough, to judge how far a prediction may be off.
 _FOCAL_PX, _NEAR_WALL_M = 525.0, 1.5
 # Patches are looked for again while poses move by more than a patch's alignment makes up for.
-_MAX_ROUNDS, _SETTLED_PX = 9, 1.5
+_MAX_ROUNDS, _SETTLED_PX = 9, 3.0
 _DEPTH_ROUNDS = 4  # of pairs that nothing but the drawing predicts
 # What is far off must not count as an outlier at once: noise goes down to what it is.
 _GRADUATED_NOISE = tuple(
@@ -155,9 +155,7 @@ def _observe_all(
     sharing = [view for view in views if view.camera_id in wanted]
     cameras = {}
     with ThreadPoolExecutor(os.cpu_count()) as pool:  # detectors run without the interpreter's lock
-        observed = pool.map(
-            lambda v: observe(v, wanted[v.camera_id], settings.max_keypoints, settings.pixel_sigma), sharing
-        )
+        observed = pool.map(lambda v: observe(v, wanted[v.camera_id], settings), sharing)
         for view, camera in zip(sharing, observed, strict=True):
             cameras[view.camera_id] = camera
             stages.tell(len(cameras) / len(sharing))

@@ -6,11 +6,12 @@ import numpy as np
 import numpy.typing as npt
 
 from rig_calib.depth_model import DepthGrid, depth_grid, disparity_image
-from rig_calib.features import Keypoints, detect, mean_grey
+from rig_calib.features import Keypoints, detect, detect_coarsely, mean_grey
 from rig_calib.keypoint_depth import KeypointDepth, keypoint_depth, keypoint_points, mean_disparity
 from rig_calib.overlap import Region
 from rig_calib.patch_alignment import ImageF32, smoothed
 from rig_calib.registration import Side
+from rig_calib.settings import CalibrationSettings
 from rig_calib.view import CameraView
 
 Array = npt.NDArray[np.float64]
@@ -57,7 +58,7 @@ def missing_images(view: CameraView) -> str | None:
     return None if view.color else "no colour image"
 
 
-def observe(view: CameraView, region: Region, max_keypoints: int, pixel_sigma: float) -> ObservedCamera:
+def observe(view: CameraView, region: Region, settings: CalibrationSettings) -> ObservedCamera:
     """Detect keypoints in a region and look up their depth; all frames of the view are averaged.
 
     DataError when the depth images do not fit the camera model.
@@ -67,7 +68,8 @@ def observe(view: CameraView, region: Region, max_keypoints: int, pixel_sigma: f
     images = [disparity_image(view, frame) for frame in range(frames)]
     disparity = mean_disparity(images or [_no_disparity(grid)])
     grey = mean_grey(view.color)
-    keypoints = detect(grey, region, max_keypoints, pixel_sigma)
+    find = detect if settings.method == "paper" else detect_coarsely
+    keypoints = find(grey, region, settings.max_keypoints, settings.pixel_sigma)
     depth = keypoint_depth(view.model.color, grid, disparity, keypoints.pixels, max(frames, 1))
     points = keypoint_points(view.model.color, grid, keypoints.pixels, depth)
     return ObservedCamera(view, grid, smoothed(grey), disparity, keypoints, depth, points)
