@@ -201,16 +201,21 @@ def _solve_jointly(
         return _Solution(cameras, graph.edges, {}, None)
     rig = adjust_rig(cameras, _used_matches(graph.edges), start, ring, settings)
     far = {pair for pair, px in _prediction_px(rig, regions).items() if px > _FAR_AND_WIDE_PX}
+    noise = AT_REST
     for k in range(_MAX_ROUNDS):
         before, prediction_px = rig.poses, _prediction_px(rig, regions)
         depth_only = far if k < _DEPTH_ROUNDS else set()
         refined = refine(cameras, regions, before, rig.corrections, prediction_px, depth_only)
         matches = _verified(refined, far - depth_only, prediction_px, settings)
-        noise = _GRADUATED_NOISE[k] if far and k < len(_GRADUATED_NOISE) else AT_REST
-        rig = adjust_rig(refined.cameras, matches, before, ring, settings, noise)
-        if noise is AT_REST and _largest_shift_px(before, rig.poses, regions) < _SETTLED_PX:
-            break
-    rig = adjust_rig(refined.cameras, matches, rig.poses, ring, settings, rig.observed_noise())
+        graduated = bool(far) and k < len(_GRADUATED_NOISE)
+        rig = adjust_rig(
+            refined.cameras, matches, before, ring, settings, _GRADUATED_NOISE[k] if graduated else noise
+        )
+        if not graduated:
+            noise = rig.observed_noise()
+            if _largest_shift_px(before, rig.poses, regions) < _SETTLED_PX:
+                break
+    rig = adjust_rig(refined.cameras, matches, rig.poses, ring, settings, noise)
     edges = [_refined_edge(edge, refined, matches, rig, settings) for edge in graph.edges]
     better = {c: corrected(camera, rig.corrections.get(c)) for c, camera in refined.cameras.items()}
     return _Solution(better, edges, rig.poses, rig)

@@ -17,6 +17,7 @@ _NOISE_LENGTH_PX, _DISTORTION_LENGTH_PX = 8.0, 40.0
 _NEIGHBOUR_PX = 25.0
 # The states follow some of what neighbours share, so that residuals show less of it than there is.
 _ERROR_OF_RESIDUAL = 1.3
+_SCATTER_OF_RESIDUAL = 1.2  # a point's depth takes some of its pixel's scatter
 # A patch's source defines its point: its own residual is none.
 _EXACT_PX = 0.015
 _MAD_TO_SIGMA = 1.4826  # of a normal distribution
@@ -54,19 +55,18 @@ class NoiseModel:
         return np.asarray(np.sqrt(shared + smooth))
 
 
-def observed_noise(seen: Observations, residuals: Array, point_count: int) -> NoiseModel:
+def observed_noise(seen: Observations, residuals: Array) -> NoiseModel:
     """The noise that an adjustment's whitened residuals (M,3) show, at least that of a rig at rest."""
     assumed = NoiseModel()
-    measured = np.asarray((seen.pixel_whitener != 0.0).any(axis=(1, 2)))
-    left = max(2 * int(measured.sum()) - 2 * point_count, 1)  # each point takes two coordinates for itself
-    scatter = float(np.median(np.abs(residuals[measured, :2]))) if measured.any() else 0.0
     inlier = np.asarray((np.abs(residuals) < _OUTLIER_SIGMAS).all(axis=1))
     with_depth = np.asarray(inlier & np.isfinite(seen.disparity))
     pixel_error, pixel_weight = seen.pixel_error(residuals[:, :2]), _pixel_information(seen)
-    measured &= pixel_weight < 1.0 / _EXACT_PX**2
+    measured = (seen.pixel_whitener != 0.0).any(axis=(1, 2)) & (pixel_weight < 1.0 / _EXACT_PX**2)
+    whitened = residuals[measured, :2][(seen.pixel_whitener[measured] != 0.0).any(axis=2)]
+    scatter = _MAD_TO_SIGMA * float(np.median(np.abs(whitened))) if len(whitened) else 0.0
     disparity_error = residuals[:, 2:] * seen.disparity_sigma[:, None]
     return NoiseModel(
-        max(assumed.pixel_scale, _MAD_TO_SIGMA * scatter * float(np.sqrt(2 * measured.sum() / left))),
+        max(assumed.pixel_scale, _SCATTER_OF_RESIDUAL * scatter),
         max(
             assumed.pixel_distortion,
             _shared_error(seen.camera, seen.pixels, pixel_error, pixel_weight, inlier & measured),

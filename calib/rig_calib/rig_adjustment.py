@@ -93,7 +93,7 @@ class AdjustedRig:
 
     def observed_noise(self) -> NoiseModel:
         """How noisy the capture turned out to be."""
-        return observed_noise(self.scene.observations, self.adjustment.residuals, len(self.scene.points))
+        return observed_noise(self.scene.observations, self.adjustment.residuals)
 
     def relative(self, i: int, j: int) -> tuple[Pose, Array]:
         """T_i_j and its covariance (6,6)."""
