@@ -215,7 +215,8 @@ def _solve_jointly(
             noise = rig.observed_noise()
             if _largest_shift_px(before, rig.poses, regions) < _SETTLED_PX:
                 break
-    rig = adjust_rig(refined.cameras, matches, rig.poses, ring, settings, noise)
+    if noise.differs_from(rig.noise):
+        rig = adjust_rig(refined.cameras, matches, rig.poses, ring, settings, noise)
     edges = [_refined_edge(edge, refined, matches, rig, settings) for edge in graph.edges]
     better = {c: corrected(camera, rig.corrections.get(c)) for c, camera in refined.cameras.items()}
     return _Solution(better, edges, rig.poses, rig)

@@ -1,6 +1,6 @@
 """How far measurements can be trusted: white noise, errors that neighbours share, and how much there was."""
 
-from dataclasses import dataclass
+from dataclasses import astuple, dataclass
 
 import numpy as np
 import numpy.typing as npt
@@ -20,6 +20,7 @@ _ERROR_OF_RESIDUAL = 1.3
 _SCATTER_OF_RESIDUAL = 1.2  # a point's depth takes some of its pixel's scatter
 # A patch's source defines its point: its own residual is none.
 _EXACT_PX = 0.015
+_WORTH_REPEATING = 0.25  # of a standard deviation's size
 _MAD_TO_SIGMA = 1.4826  # of a normal distribution
 _OUTLIER_SIGMAS = 3.0
 
@@ -36,6 +37,11 @@ class NoiseModel:
     pixel_scale: float = 1.0
     pixel_distortion: float = 0.02
     disparity_distortion: float = 0.3 * DISPARITY_SIGMA
+
+    def differs_from(self, other: "NoiseModel") -> bool:
+        """Whether an estimate with the other's weights is worth repeating with these."""
+        ours, others = astuple(self), astuple(other)
+        return any(abs(a - b) > _WORTH_REPEATING * b for a, b in zip(ours, others, strict=True))
 
     def pixel_whitener(self, information: Array, pixels: Array) -> Array:
         """Whiteners W (N,2,2) of one camera's pixels: WᵀW is what is known of each in its crowd.

@@ -74,6 +74,7 @@ class AdjustedRig:
     covariance: PoseCovariance
     scene: Scene
     adjustment: Adjustment
+    noise: NoiseModel
 
     def covariance_of(self, camera_id: int) -> Array:
         """Covariance (6,6) of one camera's pose in the adjustment's frame."""
@@ -132,6 +133,7 @@ def adjust_rig(
         covariance=pose_covariance(result, adjusted),
         scene=scene,
         adjustment=result,
+        noise=noise,
     )
 
 
