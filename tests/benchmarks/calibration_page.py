@@ -59,6 +59,7 @@ _REFERENCE_ROWS: Sequence[tuple[str, Callable[[Section], str], str]] = (
     ("RMS error of neighbours", lambda one: _both(one, "rmse_"), ""),
     ("Cramér-Rao bound of that", lambda one: _both(one, "bound_"), ""),
     ("efficiency", lambda one: f"{one['efficiency_deg']:.2f} / {one['efficiency_mm']:.2f}", "≥ 0.7"),
+    ("bound of its own points", lambda one: _both(one, "bound_of_tracks_"), ""),
     ("bound of the images", lambda one: _both(one, "bound_of_images_"), ""),
     ("mean error of opposite cameras", lambda one: _both(one, "opposite_"), ""),
     ("... over that of neighbours", lambda one: f"{one['opposite_ratio']:.2f}", "≤ 2"),
