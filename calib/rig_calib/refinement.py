@@ -6,7 +6,9 @@ where a wall is blank, depth is compared alone (a point-to-plane term). What is 
 keypoints in the same adjustment.
 """
 
+import os
 from collections.abc import Mapping, Sequence, Set
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 import cv2
@@ -73,11 +75,14 @@ def refine(
     Pairs of `depth_only` compare depth alone, which leads to the right place from farther away than texture.
     """
     spread = {c: _spread_pixels(camera.image) for c, camera in cameras.items() if c in poses}
-    halves = []
-    for (i, j), sides in regions.items():
-        if i in poses and j in poses:
-            reach = None if (i, j) in depth_only else prediction_px[i, j]
-            halves += _align_pair(cameras, spread, (i, j), sides, poses, corrections, reach)
+    pairs = [pair for pair in regions if pair[0] in poses and pair[1] in poses]
+
+    def align(pair: Pair) -> list[_Half]:
+        reach = None if pair in depth_only else prediction_px[pair]
+        return _align_pair(cameras, spread, pair, regions[pair], poses, corrections, reach)
+
+    with ThreadPoolExecutor(os.cpu_count()) as pool:  # the compiled loops run without the interpreter's lock
+        halves = [half for both in pool.map(align, pairs) for half in both]
     return _collect(cameras, halves)
 
 
