@@ -95,7 +95,7 @@ def run(full: bool) -> dict[str, Any]:
         tasks = [(seed, QUIET_FRAMES[full]) for seed in QUIET_ROOMS]
         quiet = list(pool.imap(quiet_room, tasks))
     figures = {"bumps": [_summary(name, bumps) for name, _, _ in BUMPS], **_quiet_summary(quiet)}
-    print(_tables(figures))
+    print(tables(figures))
     for one in bumps:
         if one["named"] != [one["camera"]]:
             print(f"  {one}")
@@ -136,7 +136,8 @@ def _quiet_summary(quiet: Sequence[dict[str, Any]]) -> dict[str, Any]:
     }
 
 
-def _tables(figures: dict[str, Any]) -> str:
+def tables(figures: dict[str, Any]) -> str:
+    """Bumps found and rooms watched in peace, as Markdown."""
     rows = [
         [
             one["bump"],
