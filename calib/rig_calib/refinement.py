@@ -8,6 +8,7 @@ keypoints in the same adjustment.
 
 from collections.abc import Mapping, Sequence, Set
 from dataclasses import dataclass
+from types import MappingProxyType
 
 import cv2
 import numpy as np
@@ -38,6 +39,7 @@ _BLANK_STEP = 2  # of the cells without texture, every second one compares depth
 _REACH_PX = 3.0  # farther than this, and than three standard deviations of the prediction, is another place
 _PYRAMID_FROM_PX = 1.0  # predictions worse than this are looked for in smaller images first
 _MAX_LEVELS = 2
+_NO_MATCHES: Matches = np.empty((0, 2), dtype=np.intp)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -57,6 +59,7 @@ class _Half:
     source_pixels: Array
     target_pixels: Array
     information: Array  # on target_pixels
+    source_information: Array | None = None  # None: a patch, which defines its point
 
 
 def refine(
@@ -66,8 +69,9 @@ def refine(
     corrections: Mapping[int, DepthCorrection | None],
     prediction_px: Mapping[Pair, float],
     depth_only: Set[Pair] = frozenset(),
+    keypoint_matches: Mapping[Pair, Matches] = MappingProxyType({}),
 ) -> RefinedRig:
-    """Find patches for every pair whose cameras both have a pose.
+    """Find patches for every pair whose cameras both have a pose; one without any keeps `keypoint_matches`.
 
     `prediction_px` is the standard deviation, in pixels, with which the poses predict where a patch lies.
     Pairs of `depth_only` compare depth alone, which leads to the right place from farther away than texture.
@@ -77,7 +81,10 @@ def refine(
     for (i, j), sides in regions.items():
         if i in poses and j in poses:
             reach = None if (i, j) in depth_only else prediction_px[i, j]
-            halves += _align_pair(cameras, spread, (i, j), sides, poses, corrections, reach)
+            found = _align_pair(cameras, spread, (i, j), sides, poses, corrections, reach)
+            if not any(len(half.source_pixels) for half in found):
+                found = [_keypoint_half(cameras[i], cameras[j], keypoint_matches.get((i, j), _NO_MATCHES))]
+            halves += found
     return _collect(cameras, halves)
 
 
@@ -138,6 +145,19 @@ def _align_half(
     information[~good], found[~good] = 0.0, start[~good]
     keep = good | blank
     return _Half(*ids, pixels[keep].astype(np.float64), found[keep], information[keep])
+
+
+def _keypoint_half(source: ObservedCamera, target: ObservedCamera, matches: Matches) -> _Half:
+    a, b = source.keypoints, target.keypoints
+    rows, columns = matches[:, 0], matches[:, 1]
+    return _Half(
+        source.view.camera_id,
+        target.view.camera_id,
+        a.pixels[rows],
+        b.pixels[columns],
+        b.information[columns],
+        a.information[rows],
+    )
 
 
 def _align_from_coarse(
@@ -204,9 +224,11 @@ def _collect(cameras: Mapping[int, ObservedCamera], halves: Sequence[_Half]) -> 
         return np.arange(first, count[camera])
 
     for half in halves:
-        exact = np.broadcast_to(np.eye(2) / _SOURCE_SIGMA_PX**2, half.information.shape)
+        of_source = half.source_information
+        if of_source is None:
+            of_source = np.broadcast_to(np.eye(2) / _SOURCE_SIGMA_PX**2, half.information.shape)
         ends = {
-            half.source: add(half.source, half.source_pixels, exact),
+            half.source: add(half.source, half.source_pixels, of_source),
             half.target: add(half.target, half.target_pixels, half.information),
         }
         pair = min(ends), max(ends)

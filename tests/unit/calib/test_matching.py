@@ -18,7 +18,8 @@ WHOLE = (Region(0, 0, 640, 480), Region(0, 0, 640, 480))
 def keypoints(descriptors: np.ndarray, place: list[int] | None = None) -> Keypoints:
     count = len(descriptors)
     pixels = np.column_stack([np.arange(count) * 10.0, np.full(count, 100.0)])
-    return Keypoints(pixels, np.ones(count), descriptors.astype(np.float32), np.array(place or range(count)))
+    information = np.broadcast_to(np.eye(2), (count, 2, 2))
+    return Keypoints(pixels, information, descriptors.astype(np.float32), np.array(place or range(count)))
 
 
 def random_descriptors(count: int, seed: int = 0) -> np.ndarray:
