@@ -14,7 +14,7 @@ import numpy as np
 from rig_calib import gate
 from rig_calib.alignment import align_frames
 from rig_calib.consistency import ConsistentGraph, consistent_graph, pose_edge
-from rig_calib.edges import TOLERANCE, Edge, measure_edge
+from rig_calib.edges import TOLERANCE, Edge, estimate_edge, measure_edge
 from rig_calib.evidence import EdgeEvidence
 from rig_calib.loops import closing_cycle
 from rig_calib.matching import Matches, flann_matches, mutual_matches
@@ -41,7 +41,7 @@ _OVERLAP_MARGIN_DEG = 7.0
 # Rough, to judge how far a prediction may be off.
 _FOCAL_PX, _NEAR_WALL_M = 525.0, 1.5
 # Patches are looked for again while poses move by more than a patch's alignment makes up for.
-_MAX_ROUNDS, _SETTLED_PX = 9, 1.5
+_MAX_ROUNDS, _SETTLED_PX = 9, 3.0
 _DEPTH_ROUNDS = 4  # of pairs that nothing but the drawing predicts
 # What is far off must not count as an outlier at once: noise goes down to what it is.
 _GRADUATED_NOISE = tuple(
@@ -155,9 +155,7 @@ def _observe_all(
     sharing = [view for view in views if view.camera_id in wanted]
     cameras = {}
     with ThreadPoolExecutor(os.cpu_count()) as pool:  # detectors run without the interpreter's lock
-        observed = pool.map(
-            lambda v: observe(v, wanted[v.camera_id], settings.max_keypoints, settings.pixel_sigma), sharing
-        )
+        observed = pool.map(lambda v: observe(v, wanted[v.camera_id], settings), sharing)
         for view, camera in zip(sharing, observed, strict=True):
             cameras[view.camera_id] = camera
             stages.tell(len(cameras) / len(sharing))
@@ -204,6 +202,7 @@ def _solve_jointly(
     keypoint_matches = _used_matches(graph.edges)
     rig = adjust_rig(cameras, keypoint_matches, start, ring, settings)
     far = {pair for pair, px in _prediction_px(rig, regions).items() if px > _FAR_AND_WIDE_PX}
+    noise = AT_REST
     for k in range(_MAX_ROUNDS):
         before, prediction_px = rig.poses, _prediction_px(rig, regions)
         depth_only = far if k < _DEPTH_ROUNDS else set()
@@ -211,12 +210,17 @@ def _solve_jointly(
             cameras, regions, before, rig.corrections, prediction_px, depth_only, keypoint_matches
         )
         matches = _verified(refined, far - depth_only, prediction_px, settings)
-        noise = _GRADUATED_NOISE[k] if far and k < len(_GRADUATED_NOISE) else AT_REST
-        rig = adjust_rig(refined.cameras, matches, before, ring, settings, noise)
-        if noise is AT_REST and _largest_shift_px(before, rig.poses, regions) < _SETTLED_PX:
-            break
-    rig = adjust_rig(refined.cameras, matches, rig.poses, ring, settings, rig.observed_noise())
-    edges = [_refined_edge(edge, matches) for edge in graph.edges]
+        graduated = bool(far) and k < len(_GRADUATED_NOISE)
+        rig = adjust_rig(
+            refined.cameras, matches, before, ring, settings, _GRADUATED_NOISE[k] if graduated else noise
+        )
+        if not graduated:
+            noise = rig.observed_noise()
+            if _largest_shift_px(before, rig.poses, regions) < _SETTLED_PX:
+                break
+    if noise.differs_from(rig.noise):
+        rig = adjust_rig(refined.cameras, matches, rig.poses, ring, settings, noise)
+    edges = [_refined_edge(edge, refined, matches, rig, settings) for edge in graph.edges]
     better = {c: corrected(camera, rig.corrections.get(c)) for c, camera in refined.cameras.items()}
     return _Solution(better, edges, rig.poses, rig)
 
@@ -261,10 +265,21 @@ def _largest_shift_px(before: Mapping[int, Pose], after: Mapping[int, Pose], pai
     return max(shifts)
 
 
-def _refined_edge(edge: Edge, matches: Mapping[Pair, Matches]) -> Edge:
-    """The edge with its patches for matches."""
+def _refined_edge(
+    edge: Edge,
+    refined: RefinedRig,
+    matches: Mapping[Pair, Matches],
+    rig: AdjustedRig,
+    settings: CalibrationSettings,
+) -> Edge:
+    """What the pair's patches alone say; without any it keeps why its keypoints gave nothing."""
+    i, j = edge.pair
     rows = matches.get(edge.pair, _NO_MATCHES)
-    return replace(edge, matches=rows, inlier=np.ones(len(rows), dtype=bool))
+    if not len(rows):
+        reason = edge.reason or "nothing that both cameras recognise was left when depth was corrected"
+        return replace(edge, matches=_NO_MATCHES, inlier=np.zeros(0, dtype=bool), reason=reason)
+    T_i_j = inverse(rig.poses[i]) @ rig.poses[j]
+    return estimate_edge(refined.cameras[i], refined.cameras[j], rows, T_i_j, settings)
 
 
 def _prediction_px(rig: AdjustedRig, pairs: Iterable[Pair]) -> dict[Pair, float]:

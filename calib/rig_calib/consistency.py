@@ -114,6 +114,9 @@ def _best_proposal(
     rng = np.random.default_rng(seed)
     listed = list(edges.values())
     cost = np.array([np.trace(np.linalg.inv(edge.information)) for edge in listed])
+    simplest = chain_poses(spanning_tree(listed, cost.tolist()), group[0], np.eye(4))
+    if (squared_distances(listed, simplest) <= _AGREEMENT).all():
+        return simplest  # nothing contradicts anything
     costs = [cost, *(rng.exponential(cost) for _ in range(_TREES - 1))]
     trees = [chain_poses(spanning_tree(listed, one.tolist()), group[0], np.eye(4)) for one in costs]
 

@@ -72,7 +72,7 @@ def estimate_edge(
     ids = (i.view.camera_id, j.view.camera_id)
     inlier = agreeing(start, i.side(matches[:, 0]), j.side(matches[:, 1]), TOLERANCE)
     both = i.depth.known[matches[:, 0]] & j.depth.known[matches[:, 1]] & inlier
-    if inlier.sum() < settings.min_inliers or both.sum() < 3:
+    if inlier.sum() < settings.min_inliers or (settings.method == "paper" and both.sum() < 3):
         return Edge(*ids, matches, inlier, reason=_unsupported(len(matches), settings))
     p_i, p_j = i.points[matches[both, 0]], j.points[matches[both, 1]]
     if settings.method == "paper":
@@ -82,8 +82,9 @@ def estimate_edge(
             {ids[0]: i, ids[1]: j}, {ids: matches[inlier]}, {ids[0]: np.eye(4), ids[1]: start}, None, settings
         )
         T_i_j, covariance = pair.relative(*ids)
-    distances = np.linalg.norm(p_i - transform_points(T_i_j, p_j), axis=1)
-    edge = Edge(*ids, matches, inlier, T_i_j, covariance, float(np.sqrt(np.mean(distances**2)) * 1e3))
+    squared_m = ((p_i - transform_points(T_i_j, p_j)) ** 2).sum(axis=1)
+    rms_mm = float(np.sqrt(squared_m.mean()) * 1e3) if len(squared_m) else 0.0
+    edge = Edge(*ids, matches, inlier, T_i_j, covariance, rms_mm)
     weakness = _weakness(covariance, settings)
     return edge if weakness is None else edge.refused(weakness)
 

@@ -1,7 +1,7 @@
 """Keypoints with descriptors (SIFT, Lowe 2004) of one camera's colour images."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import cv2
 import numpy as np
@@ -46,6 +46,15 @@ def mean_grey(images: Sequence[ImageU8]) -> ImageU8:
     if len(grey) == 1:
         return np.asarray(grey[0], dtype=np.uint8)
     return np.rint(np.mean(np.stack(grey), axis=0, dtype=np.float64)).astype(np.uint8)
+
+
+def detect_coarsely(image: ImageU8, region: Region, max_keypoints: int, pixel_sigma: float) -> Keypoints:
+    """As `detect`, on the image at half its size: a third of the time, for what patches refine later."""
+    half = np.asarray(cv2.resize(image, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA), dtype=np.uint8)
+    part = Region(region.left // 2, region.top // 2, (region.right + 1) // 2, (region.bottom + 1) // 2)
+    found = detect(half, part, max_keypoints, pixel_sigma)
+    # The centre of a pixel of half the size lies between four.
+    return replace(found, pixels=2.0 * found.pixels + 0.5, information=0.25 * found.information)
 
 
 def detect(image: ImageU8, region: Region, max_keypoints: int, pixel_sigma: float) -> Keypoints:

@@ -44,26 +44,28 @@ def unclosed(graph: ConsistentGraph) -> list[str]:
 def unsupported(
     edges: Sequence[Edge], rig: AdjustedRig | None, drawn: bool, settings: CalibrationSettings
 ) -> tuple[list[str], list[str]]:
-    """Failures and warnings about edges that are not used.
+    """Failures and warnings about pairs whose relative pose lacks support.
 
-    With a drawing every candidate is expected to hold. One that does not is a failure when its two cameras
-    are not held firmly by other edges either; else a warning. Without a covariance (`rig` is None) it is a
-    warning.
+    With a drawing every candidate is expected to hold. A pair whose relative pose the whole rig does not know
+    well enough is a failure; one whose own matches leave something open that others make up for is a warning.
+    Without a covariance (`rig` is None) it is a warning, too.
     """
     failures, warnings = [], []
     for edge in edges:
-        if edge.reason is None:
-            continue
         sigma_deg, sigma_m = _relative_sigma(edge, rig)
-        told = f"edge {edge.i}–{edge.j} is not used: {edge.reason}"
-        if drawn and (sigma_deg > settings.max_edge_sigma_deg or sigma_m > settings.max_edge_sigma_m):
+        told = f"edge {edge.i}–{edge.j}: {edge.reason or 'its matches are few'}"
+        if drawn and (sigma_deg > settings.max_pair_sigma_deg or sigma_m > settings.max_pair_sigma_m):
             failures.append(
-                f"{told}; without it their relative pose is only known to {sigma_deg:.1f}° and "
-                f"{sigma_m * 1e3:.0f} mm: {MORE_MATCHES}"
+                f"{told}; the relative pose of cameras {edge.i} and {edge.j} is only known to "
+                f"{sigma_deg:.1f}° and {sigma_m * 1e3:.0f} mm: {MORE_MATCHES}"
             )
-        elif drawn or (edge.T_i_j is not None and edge.inlier.sum() >= 2 * settings.min_inliers):
+        elif edge.reason is not None and (drawn or _has_a_pose_of_its_own(edge, settings)):
             warnings.append(told)
     return failures, warnings
+
+
+def _has_a_pose_of_its_own(edge: Edge, settings: CalibrationSettings) -> bool:
+    return edge.T_i_j is not None and bool(edge.inlier.sum() >= 2 * settings.min_inliers)
 
 
 def _relative_sigma(edge: Edge, rig: AdjustedRig | None) -> tuple[float, float]:

@@ -1,6 +1,6 @@
 """How far measurements can be trusted: white noise, errors that neighbours share, and how much there was."""
 
-from dataclasses import dataclass
+from dataclasses import astuple, dataclass
 
 import numpy as np
 import numpy.typing as npt
@@ -17,8 +17,10 @@ _NOISE_LENGTH_PX, _DISTORTION_LENGTH_PX = 8.0, 40.0
 _NEIGHBOUR_PX = 25.0
 # The states follow some of what neighbours share, so that residuals show less of it than there is.
 _ERROR_OF_RESIDUAL = 1.3
+_SCATTER_OF_RESIDUAL = 1.2  # a point's depth takes some of its pixel's scatter
 # A patch's source defines its point: its own residual is none.
 _EXACT_PX = 0.015
+_WORTH_REPEATING = 0.25  # of a standard deviation's size
 _MAD_TO_SIGMA = 1.4826  # of a normal distribution
 _OUTLIER_SIGMAS = 3.0
 
@@ -35,6 +37,11 @@ class NoiseModel:
     pixel_scale: float = 1.0
     pixel_distortion: float = 0.02
     disparity_distortion: float = 0.3 * DISPARITY_SIGMA
+
+    def differs_from(self, other: "NoiseModel") -> bool:
+        """Whether an estimate with the other's weights is worth repeating with these."""
+        ours, others = astuple(self), astuple(other)
+        return any(abs(a - b) > _WORTH_REPEATING * b for a, b in zip(ours, others, strict=True))
 
     def pixel_whitener(self, information: Array, pixels: Array) -> Array:
         """Whiteners W (N,2,2) of one camera's pixels: WᵀW is what is known of each in its crowd.
@@ -54,19 +61,18 @@ class NoiseModel:
         return np.asarray(np.sqrt(shared + smooth))
 
 
-def observed_noise(seen: Observations, residuals: Array, point_count: int) -> NoiseModel:
+def observed_noise(seen: Observations, residuals: Array) -> NoiseModel:
     """The noise that an adjustment's whitened residuals (M,3) show, at least that of a rig at rest."""
     assumed = NoiseModel()
-    measured = np.asarray((seen.pixel_whitener != 0.0).any(axis=(1, 2)))
-    left = max(2 * int(measured.sum()) - 2 * point_count, 1)  # each point takes two coordinates for itself
-    scatter = float(np.median(np.abs(residuals[measured, :2]))) if measured.any() else 0.0
     inlier = np.asarray((np.abs(residuals) < _OUTLIER_SIGMAS).all(axis=1))
     with_depth = np.asarray(inlier & np.isfinite(seen.disparity))
     pixel_error, pixel_weight = seen.pixel_error(residuals[:, :2]), _pixel_information(seen)
-    measured &= pixel_weight < 1.0 / _EXACT_PX**2
+    measured = (seen.pixel_whitener != 0.0).any(axis=(1, 2)) & (pixel_weight < 1.0 / _EXACT_PX**2)
+    whitened = residuals[measured, :2][(seen.pixel_whitener[measured] != 0.0).any(axis=2)]
+    scatter = _MAD_TO_SIGMA * float(np.median(np.abs(whitened))) if len(whitened) else 0.0
     disparity_error = residuals[:, 2:] * seen.disparity_sigma[:, None]
     return NoiseModel(
-        max(assumed.pixel_scale, _MAD_TO_SIGMA * scatter * float(np.sqrt(2 * measured.sum() / left))),
+        max(assumed.pixel_scale, _SCATTER_OF_RESIDUAL * scatter),
         max(
             assumed.pixel_distortion,
             _shared_error(seen.camera, seen.pixels, pixel_error, pixel_weight, inlier & measured),

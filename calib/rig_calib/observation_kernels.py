@@ -92,6 +92,18 @@ def _turned_back(R: Array, c: int, X: float, Y: float, Z: float) -> tuple[float,
 
 
 @inlined
+def distorted(k: Array, c: int, x: float, y: float) -> tuple[float, float]:
+    """Distorted normalised coordinates of a ray, by the intrinsics k[c]."""
+    k1, k2, p1, p2, k3 = k[c, 4], k[c, 5], k[c, 6], k[c, 7], k[c, 8]
+    r2 = x * x + y * y
+    radial = 1.0 + r2 * (k1 + r2 * (k2 + r2 * k3))
+    return (
+        x * radial + 2.0 * p1 * x * y + p2 * (r2 + 2.0 * x * x),
+        y * radial + p1 * (r2 + 2.0 * y * y) + 2.0 * p2 * x * y,
+    )
+
+
+@inlined
 def _project(k: Array, c: int, X: float, Y: float, Z: float, J: Array) -> tuple[float, float]:
     """Pixel of a point, and its derivative J (2,4) by the point and by k1."""
     x, y = X / Z, Y / Z
@@ -108,9 +120,8 @@ def _project(k: Array, c: int, X: float, Y: float, Z: float, J: Array) -> tuple[
     J[0, 2] = -(J[0, 0] * x + J[0, 1] * y)
     J[1, 2] = -(J[1, 0] * x + J[1, 1] * y)
     J[0, 3], J[1, 3] = k[c, 0] * x * r2, k[c, 1] * y * r2
-    distorted_x = x * radial + 2.0 * p1 * x * y + p2 * (r2 + 2.0 * x * x)
-    distorted_y = y * radial + p1 * (r2 + 2.0 * y * y) + 2.0 * p2 * x * y
-    return k[c, 0] * distorted_x + k[c, 2], k[c, 1] * distorted_y + k[c, 3]
+    x, y = distorted(k, c, x, y)
+    return k[c, 0] * x + k[c, 2], k[c, 1] * y + k[c, 3]
 
 
 @inlined

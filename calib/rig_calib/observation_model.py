@@ -156,8 +156,8 @@ class FactoryModels:
     def of(cls, color: Sequence[Intrinsics], grids: Sequence[DepthGrid], bias_terms: int) -> "FactoryModels":
         """From one colour camera and one grid a camera."""
         return cls(
-            color=np.array([_numbers(intrinsics) for intrinsics in color]),
-            grid=np.array([_numbers(grid.intrinsics) for grid in grids]),
+            color=np.array([intrinsics_row(intrinsics) for intrinsics in color]),
+            grid=np.array([intrinsics_row(grid.intrinsics) for grid in grids]),
             T_color_grid=np.array([grid.T_color_grid for grid in grids], dtype=np.float64),
             raw_model=np.array([(grid.raw_model.numerator_m, grid.raw_model.offset) for grid in grids]),
             grids=tuple(grids),
@@ -253,5 +253,6 @@ def _determinant(W: Array) -> Array:
     return np.asarray(W[:, 0, 0] * W[:, 1, 1] - W[:, 0, 1] * W[:, 1, 0])
 
 
-def _numbers(intrinsics: Intrinsics) -> tuple[float, ...]:
+def intrinsics_row(intrinsics: Intrinsics) -> tuple[float, ...]:
+    """The nine numbers of a camera that compiled loops take."""
     return (intrinsics.fx, intrinsics.fy, intrinsics.cx, intrinsics.cy, *intrinsics.dist)

@@ -6,11 +6,12 @@ import numpy as np
 import numpy.typing as npt
 
 from rig_calib.depth_model import DepthGrid, depth_grid, disparity_image
-from rig_calib.features import Keypoints, detect, mean_grey
+from rig_calib.features import Keypoints, detect, detect_coarsely, mean_grey
 from rig_calib.keypoint_depth import KeypointDepth, keypoint_depth, keypoint_points, mean_disparity
 from rig_calib.overlap import Region
 from rig_calib.patch_alignment import ImageF32, smoothed
 from rig_calib.registration import Side
+from rig_calib.settings import CalibrationSettings
 from rig_calib.view import CameraView
 
 Array = npt.NDArray[np.float64]
@@ -49,28 +50,30 @@ class ObservedCamera:
     @property
     def depth_frames(self) -> int:
         """How many depth images were averaged."""
-        return len(self.view.raw) or len(self.view.depth_mm)
+        return max(len(self.view.raw), len(self.view.depth_mm), 1)
 
 
 def missing_images(view: CameraView) -> str | None:
     """Why a view cannot be calibrated, or None when it can."""
-    if not view.color:
-        return "no colour image"
-    if not view.raw and not view.depth_mm:
-        return "no depth image"
-    return None
+    return None if view.color else "no colour image"
 
 
-def observe(view: CameraView, region: Region, max_keypoints: int, pixel_sigma: float) -> ObservedCamera:
+def observe(view: CameraView, region: Region, settings: CalibrationSettings) -> ObservedCamera:
     """Detect keypoints in a region and look up their depth; all frames of the view are averaged.
 
     DataError when the depth images do not fit the camera model.
     """
     grid = depth_grid(view.model, view.depth_frame)
     frames = len(view.raw) or len(view.depth_mm)
-    disparity = mean_disparity([disparity_image(view, frame) for frame in range(frames)])
+    images = [disparity_image(view, frame) for frame in range(frames)]
+    disparity = mean_disparity(images or [_no_disparity(grid)])
     grey = mean_grey(view.color)
-    keypoints = detect(grey, region, max_keypoints, pixel_sigma)
-    depth = keypoint_depth(view.model.color, grid, disparity, keypoints.pixels, frames)
+    find = detect if settings.method == "paper" else detect_coarsely
+    keypoints = find(grey, region, settings.max_keypoints, settings.pixel_sigma)
+    depth = keypoint_depth(view.model.color, grid, disparity, keypoints.pixels, max(frames, 1))
     points = keypoint_points(view.model.color, grid, keypoints.pixels, depth)
     return ObservedCamera(view, grid, smoothed(grey), disparity, keypoints, depth, points)
+
+
+def _no_disparity(grid: DepthGrid) -> Array:
+    return np.full((grid.intrinsics.height, grid.intrinsics.width), np.nan)

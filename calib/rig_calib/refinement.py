@@ -6,7 +6,9 @@ where a wall is blank, depth is compared alone (a point-to-plane term). What is 
 keypoints in the same adjustment.
 """
 
+import os
 from collections.abc import Mapping, Sequence, Set
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from types import MappingProxyType
 
@@ -77,14 +79,17 @@ def refine(
     Pairs of `depth_only` compare depth alone, which leads to the right place from farther away than texture.
     """
     spread = {c: _spread_pixels(camera.image) for c, camera in cameras.items() if c in poses}
-    halves = []
-    for (i, j), sides in regions.items():
-        if i in poses and j in poses:
-            reach = None if (i, j) in depth_only else prediction_px[i, j]
-            found = _align_pair(cameras, spread, (i, j), sides, poses, corrections, reach)
-            if not any(len(half.source_pixels) for half in found):
-                found = [_keypoint_half(cameras[i], cameras[j], keypoint_matches.get((i, j), _NO_MATCHES))]
-            halves += found
+    pairs = [pair for pair in regions if pair[0] in poses and pair[1] in poses]
+
+    def align(pair: Pair) -> list[_Half]:
+        reach = None if pair in depth_only else prediction_px[pair]
+        found = _align_pair(cameras, spread, pair, regions[pair], poses, corrections, reach)
+        if any(len(half.source_pixels) for half in found):
+            return found
+        return [_keypoint_half(cameras, pair, keypoint_matches.get(pair, _NO_MATCHES))]
+
+    with ThreadPoolExecutor(os.cpu_count()) as pool:  # the compiled loops run without the interpreter's lock
+        halves = [half for both in pool.map(align, pairs) for half in both]
     return _collect(cameras, halves)
 
 
@@ -147,17 +152,11 @@ def _align_half(
     return _Half(*ids, pixels[keep].astype(np.float64), found[keep], information[keep])
 
 
-def _keypoint_half(source: ObservedCamera, target: ObservedCamera, matches: Matches) -> _Half:
-    a, b = source.keypoints, target.keypoints
+def _keypoint_half(cameras: Mapping[int, ObservedCamera], pair: Pair, matches: Matches) -> _Half:
+    i, j = pair
+    a, b = cameras[i].keypoints, cameras[j].keypoints
     rows, columns = matches[:, 0], matches[:, 1]
-    return _Half(
-        source.view.camera_id,
-        target.view.camera_id,
-        a.pixels[rows],
-        b.pixels[columns],
-        b.information[columns],
-        a.information[rows],
-    )
+    return _Half(i, j, a.pixels[rows], b.pixels[columns], b.information[columns], a.information[rows])
 
 
 def _align_from_coarse(

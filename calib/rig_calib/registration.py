@@ -6,22 +6,26 @@ paper's estimate (eq. 4, 5) minimises the distances between the 3D points.
 
 from dataclasses import dataclass
 
+import cv2
 import numpy as np
 import numpy.typing as npt
 
-from rig_calib.projection import project
+from rig_calib.agreement import Limits, agreement
+from rig_calib.observation_model import intrinsics_row
+from rig_calib.projection import undistort_pixels
 from rig_protocol.camera import Intrinsics
 from rig_protocol.poses import Pose, hat, inverse, se3_exp, transform_points
 
 Array = npt.NDArray[np.float64]
 Mask = npt.NDArray[np.bool_]
 
-# Hypotheses scored at once: few at first, since most matches of a good pair are true, then twice as many
-# every time.
-_FIRST_BATCH, _LARGEST_BATCH = 32, 256
+# Hypotheses scored at once: fewer at first, since most matches of a good pair are true. More than one clean
+# sample is wanted: the best of some dozens starts nearer.
+_FIRST_BATCH, _LARGEST_BATCH = 128, 256
 _MAX_TRIALS = 4096
 _CONFIDENCE = 0.9999
 _POLISH_ROUNDS = 4
+_LEAST_RESECTION, _RESECTION_TRIALS = 6, 1000
 _MIN_SAMPLE_SIDE_M = 0.1  # closer points turn noise into rotation
 _GAUSS_NEWTON_STEPS = 20
 
@@ -61,10 +65,13 @@ def agreeing(T_i_j: Pose, i: Side, j: Side, tolerance: Tolerance) -> Mask:
 def ransac(
     i: Side, j: Side, tolerance: Tolerance, rng: np.random.Generator, min_inliers: int
 ) -> tuple[Pose, Mask] | None:
-    """T_i_j and the matches that agree with it, or None when fewer than `min_inliers` do."""
+    """T_i_j and the matches that agree with it, or None when fewer than `min_inliers` do.
+
+    Where only one of the cameras has depth, its points are held against the other's pixels.
+    """
     both = np.flatnonzero(i.known & j.known)
     if len(both) < 3:
-        return None
+        return _resection(i, j, tolerance, min_inliers)
     best, best_count, tried, batch = np.eye(4), 0, 0, _FIRST_BATCH
     while tried < min(_MAX_TRIALS, _trials_needed(best_count / len(i.pixels))):
         samples = _triples(both, batch, rng)
@@ -76,6 +83,33 @@ def ransac(
             if counts.max() > best_count:
                 best, best_count = poses[counts.argmax()], int(counts.max())
     return _polish(best, i, j, tolerance, min_inliers)
+
+
+def _resection(i: Side, j: Side, tolerance: Tolerance, min_inliers: int) -> tuple[Pose, Mask] | None:
+    """As `ransac`, from the points of the camera that has more of them and the pixels of the other."""
+    turned = int(j.known.sum()) > int(i.known.sum())
+    source, target = (j, i) if turned else (i, j)
+    rows = np.flatnonzero(source.known)
+    if len(rows) < max(min_inliers, _LEAST_RESECTION):
+        return None
+    focal = target.color.fx
+    found, turn, shift, _ = cv2.solvePnPRansac(
+        source.points[rows],
+        undistort_pixels(target.color, target.pixels[rows]) * focal,
+        np.diag([focal, focal, 1.0]),
+        None,
+        iterationsCount=_RESECTION_TRIALS,
+        reprojectionError=tolerance.pixels,
+        confidence=_CONFIDENCE,
+        flags=cv2.SOLVEPNP_AP3P,
+    )
+    if not found:
+        return None
+    T_target_source = np.eye(4)
+    T_target_source[:3, :3], T_target_source[:3, 3] = cv2.Rodrigues(turn)[0], shift.ravel()
+    pose = T_target_source if turned else inverse(T_target_source)
+    inlier = agreeing(pose, i, j, tolerance)
+    return (pose, inlier) if inlier.sum() >= min_inliers else None
 
 
 def align(p_i: Array, p_j: Array, weights: Array | None = None) -> Pose:
@@ -140,26 +174,10 @@ def _plausible(p_i: Array, p_j: Array, tolerance: Tolerance) -> Mask:
 
 def _agreeing_all(poses: Array, i: Side, j: Side, tolerance: Tolerance) -> Mask:
     """(B,N) for poses T_i_j (B,4,4)."""
-    inverses = np.stack([inverse(T) for T in poses])
-    good_i, depth_ok_i = _seen_alike(poses, j, i, tolerance)
-    good_j, depth_ok_j = _seen_alike(inverses, i, j, tolerance)
-    return (good_i | ~j.known) & (good_j | ~i.known) & depth_ok_i & depth_ok_j & (i.known | j.known)
-
-
-def _seen_alike(poses: Array, source: Side, target: Side, tolerance: Tolerance) -> tuple[Mask, Mask]:
-    """(B,N): which moved source points fall on the target's pixels; which are as deep as its points."""
-    points = (
-        np.nan_to_num(source.points, nan=1.0) @ poses[:, :3, :3].transpose(0, 2, 1) + poses[:, None, :3, 3]
-    )
-    ahead = points[..., 2] > 0.05
-    flat = np.where(ahead[..., None], points, 1.0).reshape(-1, 3)
-    pixels = project(target.color, flat).reshape(*points.shape[:2], 2)
-    near = ((pixels - target.pixels) ** 2).sum(axis=2) < tolerance.pixels**2
-    with np.errstate(divide="ignore"):  # points behind the camera are refused by `ahead`
-        inverse_here, inverse_there = 1.0 / points[..., 2], 1.0 / target.points[:, 2]
-    allowed = tolerance.inverse_depth + tolerance.depth_scale * inverse_there
-    as_deep = ~(np.abs(inverse_here - inverse_there) > allowed) | ~source.known
-    return np.asarray(near & ahead), np.asarray(as_deep)
+    camera_i, camera_j = (np.array([intrinsics_row(side.color)]) for side in (i, j))
+    limits = Limits(tolerance.pixels**2, tolerance.inverse_depth, tolerance.depth_scale)
+    arrays = map(np.ascontiguousarray, (poses, camera_i, i.pixels, i.points, camera_j, j.pixels, j.points))
+    return agreement(limits, *arrays)
 
 
 def _polish(pose: Pose, i: Side, j: Side, tolerance: Tolerance, min_inliers: int) -> tuple[Pose, Mask] | None:

@@ -74,6 +74,7 @@ class AdjustedRig:
     covariance: PoseCovariance
     scene: Scene
     adjustment: Adjustment
+    noise: NoiseModel
 
     def covariance_of(self, camera_id: int) -> Array:
         """Covariance (6,6) of one camera's pose in the adjustment's frame."""
@@ -93,7 +94,7 @@ class AdjustedRig:
 
     def observed_noise(self) -> NoiseModel:
         """How noisy the capture turned out to be."""
-        return observed_noise(self.scene.observations, self.adjustment.residuals, len(self.scene.points))
+        return observed_noise(self.scene.observations, self.adjustment.residuals)
 
     def relative(self, i: int, j: int) -> tuple[Pose, Array]:
         """T_i_j and its covariance (6,6)."""
@@ -132,6 +133,7 @@ def adjust_rig(
         covariance=pose_covariance(result, adjusted),
         scene=scene,
         adjustment=result,
+        noise=noise,
     )
 
 

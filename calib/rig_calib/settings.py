@@ -16,7 +16,7 @@ class CalibrationSettings(Settings):
     """`joint`: one adjustment of poses, points and depth bias. `paper`: pairs, then a pose graph."""
     seed: int = 0
     """Of every random choice, so that the same input gives the same result."""
-    max_keypoints: Annotated[int, Field(ge=50, le=20000)] = 3000
+    max_keypoints: Annotated[int, Field(ge=50, le=20000)] = 1000
     """Strongest SIFT keypoints kept of one image."""
     match_ratio: Annotated[float, Field(gt=0, lt=1)] = 0.85
     """`joint`: nearest over second-nearest descriptor distance of a match."""
@@ -41,3 +41,7 @@ class CalibrationSettings(Settings):
     """An edge whose weakest direction is known less well than this is weak and not used."""
     max_edge_sigma_m: Positive = 0.06
     """As `max_edge_sigma_deg`, for translation."""
+    max_pair_sigma_deg: Positive = 0.3
+    """A pair that should share a view and is known less well than this fails the gate."""
+    max_pair_sigma_m: Positive = 0.015
+    """As `max_pair_sigma_deg`, for translation."""

@@ -30,6 +30,8 @@ def build_tracks(
     cameras: Mapping[int, ObservedCamera], matches: Mapping[tuple[int, int], Matches]
 ) -> list[Track]:
     """Join matches that share a place into tracks; what would give a camera two places is left out."""
+    if _every_place_once(cameras, matches):
+        return [{i: a, j: b} for (i, j), pairs in sorted(matches.items()) for a, b in pairs.tolist()]
     parent: dict[tuple[int, int], tuple[int, int]] = {}
     tracks: dict[tuple[int, int], Track] = {}
 
@@ -51,6 +53,18 @@ def build_tracks(
                 parent[second] = first
                 tracks[first].update(tracks.pop(second))
     return [track for track in tracks.values() if len(track) > 1]
+
+
+def _every_place_once(
+    cameras: Mapping[int, ObservedCamera], matches: Mapping[tuple[int, int], Matches]
+) -> bool:
+    """Whether no two matches share a place, as with patches."""
+    places: dict[int, list[npt.NDArray[np.intp]]] = {}
+    for pair, rows in matches.items():
+        for camera_id, own in zip(pair, rows.T, strict=True):
+            places.setdefault(camera_id, []).append(cameras[camera_id].keypoints.place[own])
+    joined = [np.concatenate(parts) for parts in places.values()]
+    return all(len(np.unique(own)) == len(own) for own in joined)
 
 
 def build_scene(

@@ -13,6 +13,7 @@ Array = npt.NDArray[np.float64]
 
 _STEPS = 6
 _KERNEL_SIGMAS = 2.4  # Cauchy's kernel at 95 % efficiency
+_TELLING_SIGMAS = 4.0
 _MEDIAN_OF_CHI2 = {1: 0.455, 2: 1.386}
 
 
@@ -39,6 +40,15 @@ class Measurements:
     def __len__(self) -> int:
         """How many there are."""
         return len(self.residual)
+
+    def votes(self, delta: Array) -> tuple[int, float]:
+        """How many can tell a motion from none (4 σ), and the share of them that is for the motion."""
+        expected = self.jacobian @ delta
+        telling = np.einsum("nk,nk->n", expected, expected) > _TELLING_SIGMAS**2
+        # |r − e|² < |r|²
+        agreeing = np.einsum("nk,nk->n", expected, 2 * self.residual - expected) > 0
+        count = int(telling.sum())
+        return count, float((agreeing & telling).sum()) / max(count, 1)
 
 
 def move_points(points: Array) -> Array:

@@ -19,6 +19,7 @@ CHANGED_STEPS = 5.0
 _MIN_STILL = 0.35  # share of the blocks, else a camera is covered, or looks elsewhere
 _FAR_PX, _FAR_ROUNDS = 4.0, 4  # full pixels; how often shifts are looked for anew from where they were found
 _MIN_LANDMARKS = 25
+_UNANIMOUS = 0.9  # of the landmarks; bumps have 0.96 and more, furniture that was moved less
 _SETTLED_STEPS = 0.5  # of disparity
 _ROUNDS = 3  # of finding the still part by the motion, and the motion by the still part
 
@@ -67,11 +68,18 @@ def _near(reference: Reference, look: Look, change: Array, delta: Array) -> OwnV
         if still.sum() < _MIN_STILL * blocks.known.sum() or usable.sum() < _MIN_LANDMARKS:
             return OwnView(still, None)
         depth = _depth(reference, change, still & blocks.flat)
-        motion = estimate_motion((shifts.whitened(reference.jacobian, usable), depth), delta)
+        seen = shifts.whitened(reference.jacobian, usable)
+        motion = estimate_motion((seen, depth), delta)
         if motion is None or np.abs(blocks.jacobian @ (motion.delta - delta)).max() < _SETTLED_STEPS:
             break
         delta = motion.delta
-    return OwnView(still, motion)
+    return OwnView(still, motion if motion is not None and _is_unanimous(seen, motion.delta) else None)
+
+
+def _is_unanimous(seen: Measurements, delta: Array) -> bool:
+    """Whether the whole view moved: where furniture was moved, or people are many, parts of it did not."""
+    count, share = seen.votes(delta)
+    return count < _MIN_LANDMARKS or share >= _UNANIMOUS
 
 
 def _is_far(reference: Reference, delta: Array) -> bool:

@@ -90,6 +90,21 @@ def test_a_rig_that_is_pushed_as_a_whole_keeps_its_calibration(room: DriftRoom, 
     assert status.rig_mm == pytest.approx(8.0, abs=2.0)
 
 
+def test_moved_furniture_moves_no_camera(room: DriftRoom, learnt: DriftWatch) -> None:
+    """All of it at once, by 3 cm, while the walls stay: the room's surfaces are its shell, then furniture."""
+    shell, scene = 6, room.rig.scene
+    surfaces = tuple(
+        surface if number < shell else replace(surface, corner=surface.corner + np.array([0.018, 0.024, 0.0]))
+        for number, surface in enumerate(scene.surfaces)
+    )
+    moved = replace(scene, surfaces=surfaces)
+    kinects = {k: VirtualKinect(room.settings, moved, k) for k in room.kinects}
+    watch = copy.deepcopy(learnt)
+    for frame in watched_frames(BUMP_FRAME, BUMP_FRAME + 60):
+        watch.take({k: look_of(kinect, frame) for k, kinect in kinects.items()})
+        assert watch.status().moved == ()
+
+
 def test_a_camera_turned_far_is_found_again(room: DriftRoom, reference: Reference) -> None:
     kinect = room.knocked(MIDDLE, 6.0, 30.0, BUMP_FRAME)
     look = look_of(kinect, BUMP_FRAME)
