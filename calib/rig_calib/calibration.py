@@ -199,13 +199,16 @@ def _solve_jointly(
         start = _drawn(cameras) | dict(start)
     if len(start) < 2:
         return _Solution(cameras, graph.edges, {}, None)
-    rig = adjust_rig(cameras, _used_matches(graph.edges), start, ring, settings)
+    keypoint_matches = _used_matches(graph.edges)
+    rig = adjust_rig(cameras, keypoint_matches, start, ring, settings)
     far = {pair for pair, px in _prediction_px(rig, regions).items() if px > _FAR_AND_WIDE_PX}
     noise = AT_REST
     for k in range(_MAX_ROUNDS):
         before, prediction_px = rig.poses, _prediction_px(rig, regions)
         depth_only = far if k < _DEPTH_ROUNDS else set()
-        refined = refine(cameras, regions, before, rig.corrections, prediction_px, depth_only)
+        refined = refine(
+            cameras, regions, before, rig.corrections, prediction_px, depth_only, keypoint_matches
+        )
         matches = _verified(refined, far - depth_only, prediction_px, settings)
         graduated = bool(far) and k < len(_GRADUATED_NOISE)
         rig = adjust_rig(

@@ -10,6 +10,7 @@ import os
 from collections.abc import Mapping, Sequence, Set
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from types import MappingProxyType
 
 import cv2
 import numpy as np
@@ -40,6 +41,7 @@ _BLANK_STEP = 2  # of the cells without texture, every second one compares depth
 _REACH_PX = 3.0  # farther than this, and than three standard deviations of the prediction, is another place
 _PYRAMID_FROM_PX = 1.0  # predictions worse than this are looked for in smaller images first
 _MAX_LEVELS = 2
+_NO_MATCHES: Matches = np.empty((0, 2), dtype=np.intp)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -59,6 +61,7 @@ class _Half:
     source_pixels: Array
     target_pixels: Array
     information: Array  # on target_pixels
+    source_information: Array | None = None  # None: a patch, which defines its point
 
 
 def refine(
@@ -68,8 +71,9 @@ def refine(
     corrections: Mapping[int, DepthCorrection | None],
     prediction_px: Mapping[Pair, float],
     depth_only: Set[Pair] = frozenset(),
+    keypoint_matches: Mapping[Pair, Matches] = MappingProxyType({}),
 ) -> RefinedRig:
-    """Find patches for every pair whose cameras both have a pose.
+    """Find patches for every pair whose cameras both have a pose; one without any keeps `keypoint_matches`.
 
     `prediction_px` is the standard deviation, in pixels, with which the poses predict where a patch lies.
     Pairs of `depth_only` compare depth alone, which leads to the right place from farther away than texture.
@@ -79,7 +83,10 @@ def refine(
 
     def align(pair: Pair) -> list[_Half]:
         reach = None if pair in depth_only else prediction_px[pair]
-        return _align_pair(cameras, spread, pair, regions[pair], poses, corrections, reach)
+        found = _align_pair(cameras, spread, pair, regions[pair], poses, corrections, reach)
+        if any(len(half.source_pixels) for half in found):
+            return found
+        return [_keypoint_half(cameras, pair, keypoint_matches.get(pair, _NO_MATCHES))]
 
     with ThreadPoolExecutor(os.cpu_count()) as pool:  # the compiled loops run without the interpreter's lock
         halves = [half for both in pool.map(align, pairs) for half in both]
@@ -143,6 +150,13 @@ def _align_half(
     information[~good], found[~good] = 0.0, start[~good]
     keep = good | blank
     return _Half(*ids, pixels[keep].astype(np.float64), found[keep], information[keep])
+
+
+def _keypoint_half(cameras: Mapping[int, ObservedCamera], pair: Pair, matches: Matches) -> _Half:
+    i, j = pair
+    a, b = cameras[i].keypoints, cameras[j].keypoints
+    rows, columns = matches[:, 0], matches[:, 1]
+    return _Half(i, j, a.pixels[rows], b.pixels[columns], b.information[columns], a.information[rows])
 
 
 def _align_from_coarse(
@@ -209,9 +223,11 @@ def _collect(cameras: Mapping[int, ObservedCamera], halves: Sequence[_Half]) -> 
         return np.arange(first, count[camera])
 
     for half in halves:
-        exact = np.broadcast_to(np.eye(2) / _SOURCE_SIGMA_PX**2, half.information.shape)
+        of_source = half.source_information
+        if of_source is None:
+            of_source = np.broadcast_to(np.eye(2) / _SOURCE_SIGMA_PX**2, half.information.shape)
         ends = {
-            half.source: add(half.source, half.source_pixels, exact),
+            half.source: add(half.source, half.source_pixels, of_source),
             half.target: add(half.target, half.target_pixels, half.information),
         }
         pair = min(ends), max(ends)

@@ -5,6 +5,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 import numpy.typing as npt
+import scipy.spatial
 
 from rig_calib.depth_model import depth_grid, disparity_of_depth
 from rig_calib.features import Keypoints
@@ -23,6 +24,37 @@ DEPTH = Intrinsics(580.0, 580.0, 319.5, 239.5)
 MODEL = CameraModel(color=COLOR, depth=DEPTH, source="factory")
 IMAGE = np.zeros((480, 640), dtype=np.uint8)
 NO_DEPTH = np.full((480, 640), 2047, dtype=np.uint16)
+ASSUMED_SIGMA_PX = float(np.hypot(0.25, 0.05))
+"""What the settings say of a keypoint of one pixel's size."""
+_SAME_PIXEL_PX = 1e-6
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class SyntheticCamera(ObservedCamera):
+    """A camera that knows depth at its numbered points and nowhere else, whatever its images say."""
+
+    seen_pixels: Array
+    seen_depth: KeypointDepth
+
+    def depth_at(self, pixels: Array) -> KeypointDepth:
+        """Depth of the points at exactly these pixels; none where there is no point."""
+        count = len(self.seen_pixels)
+        if not count:
+            return _no_depth(len(pixels))
+        distance_px, row = scipy.spatial.KDTree(self.seen_pixels).query(pixels)
+        there, row = distance_px < _SAME_PIXEL_PX, np.minimum(row, count - 1)
+        seen = self.seen_depth
+        return KeypointDepth(
+            np.where(there, seen.disparity[row], np.nan),
+            np.where(there[:, None], seen.slope[row], np.nan),
+            np.where(there[:, None], seen.grid_pixels[row], np.nan),
+            np.where(there, seen.sigma[row], np.nan),
+        )
+
+
+def _no_depth(count: int) -> KeypointDepth:
+    nothing, nowhere = np.full(count, np.nan), np.full((count, 2), np.nan)
+    return KeypointDepth(nothing, nowhere, nowhere, nothing)
 
 
 @dataclass
@@ -92,10 +124,15 @@ class SyntheticRig:
             np.full(len(pixels), max(disparity_sigma, 0.05)),
         )
         keypoints = Keypoints(
-            pixels, np.full(len(pixels), 1.0), self.descriptors[numbers], np.arange(len(pixels))
+            pixels,
+            np.broadcast_to(np.eye(2) / ASSUMED_SIGMA_PX**2, (len(pixels), 2, 2)),
+            self.descriptors[numbers],
+            np.arange(len(pixels)),
         )
         points = keypoint_points(COLOR, grid, pixels, depth)
-        return ObservedCamera(self.view(camera, drawn), grid, keypoints, depth, points)
+        flat, nowhere = IMAGE.astype(np.float32), np.full(NO_DEPTH.shape, np.nan)
+        view = self.view(camera, drawn)
+        return SyntheticCamera(view, grid, flat, nowhere, keypoints, depth, points, pixels, depth)
 
 
 def true_matches(a: ObservedCamera, b: ObservedCamera) -> npt.NDArray[np.intp]:

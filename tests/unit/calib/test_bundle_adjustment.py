@@ -123,7 +123,7 @@ def cameras_at(
 
 def scene_of(rig: SyntheticRig, poses: dict[int, Pose], **noise: float) -> tuple[np.ndarray, Observations]:
     cameras, matches = neighbours_of(rig, **noise)
-    scene = build_scene(cameras, build_tracks(cameras, matches), poses, 0.25, NoiseModel())
+    scene = build_scene(cameras, build_tracks(cameras, matches), poses, NoiseModel())
     return scene.points, scene.observations
 
 

@@ -5,20 +5,22 @@ from dataclasses import replace
 import cv2
 import numpy as np
 
-from rig_calib.features import Keypoints, detect, mean_grey
+from rig_calib.features import Keypoints, detect, detect_coarsely, mean_grey
 from rig_calib.matching import flann_matches, mutual_matches
 from rig_calib.overlap import Region, shared_regions, whole_image
 from rig_protocol.camera import Intrinsics
 from rig_protocol.rig_folder import RingDrawing
 
 CAMERA = Intrinsics(525.0, 525.0, 319.5, 239.5)
+SIGMA_PX = 0.25
 WHOLE = (Region(0, 0, 640, 480), Region(0, 0, 640, 480))
 
 
 def keypoints(descriptors: np.ndarray, place: list[int] | None = None) -> Keypoints:
     count = len(descriptors)
     pixels = np.column_stack([np.arange(count) * 10.0, np.full(count, 100.0)])
-    return Keypoints(pixels, np.ones(count), descriptors.astype(np.float32), np.array(place or range(count)))
+    information = np.broadcast_to(np.eye(2), (count, 2, 2))
+    return Keypoints(pixels, information, descriptors.astype(np.float32), np.array(place or range(count)))
 
 
 def random_descriptors(count: int, seed: int = 0) -> np.ndarray:
@@ -55,7 +57,8 @@ def test_without_a_drawing_every_pair_may_share_everything() -> None:
 def test_keypoints_keep_to_the_region_and_do_not_depend_on_the_crop() -> None:
     image = noise_image()
     region = Region(200, 100, 400, 300)
-    found, everywhere = detect(image, region, 3000), detect(image, Region(0, 0, 640, 480), 20000)
+    found = detect(image, region, 3000, SIGMA_PX)
+    everywhere = detect(image, Region(0, 0, 640, 480), 20000, SIGMA_PX)
     assert len(found) > 20
     assert region.contains(found.pixels).all()
     distance = np.linalg.norm(found.pixels[:, None] - everywhere.pixels[None], axis=2).min(axis=1)
@@ -66,13 +69,37 @@ def test_keypoint_positions_are_not_shifted() -> None:
     """A blob drawn at a known sub-pixel place is found there."""
     v, u = np.mgrid[:200, :200]
     image = (40 + 180 * np.exp(-((u - 100.3) ** 2 + (v - 80.7) ** 2) / (2 * 4.0**2))).astype(np.uint8)
-    found = detect(image, Region(0, 0, 200, 200), 100)
+    found = detect(image, Region(0, 0, 200, 200), 100, SIGMA_PX)
     nearest = found.pixels[np.linalg.norm(found.pixels - (100.3, 80.7), axis=1).argmin()]
     np.testing.assert_allclose(nearest, (100.3, 80.7), atol=0.1)
 
 
+def test_keypoints_of_half_the_image_lie_where_the_whole_one_has_them() -> None:
+    """A blob is found without a shift, and information by the whole pixel."""
+    v, u = np.mgrid[:200, :200]
+    image = (40 + 180 * np.exp(-((u - 100.3) ** 2 + (v - 80.7) ** 2) / (2 * 6.0**2))).astype(np.uint8)
+    found = detect_coarsely(image, Region(0, 0, 200, 200), 100, SIGMA_PX)
+    nearest = np.linalg.norm(found.pixels - (100.3, 80.7), axis=1).argmin()
+    np.testing.assert_allclose(found.pixels[nearest], (100.3, 80.7), atol=0.1)
+    assert np.sqrt(1 / found.information[nearest, 0, 0]) >= 2 * SIGMA_PX
+
+
+def test_large_keypoints_are_placed_less_well() -> None:
+    v, u = np.mgrid[:400, :400]
+    image = np.full((400, 400), 60.0)
+    for at, size_px in ((60, 1.2), (240, 22.0)):
+        image += 150 * np.exp(-((u - at) ** 2 + (v - at) ** 2) / (2 * size_px**2))
+    found = detect(image.astype(np.uint8), Region(0, 0, 400, 400), 100, SIGMA_PX)
+    small, large = (np.linalg.norm(found.pixels - at, axis=1).argmin() for at in (60, 240))
+    sigma_px = np.sqrt(1 / found.information[:, 0, 0])
+    assert SIGMA_PX < sigma_px[small] < 0.3
+    assert sigma_px[large] > 0.9
+
+
 def test_an_image_without_texture_has_no_keypoints() -> None:
-    assert len(detect(np.full((480, 640), 128, np.uint8), Region(0, 0, 640, 480), 100)) == 0
+    found = detect(np.full((480, 640), 128, np.uint8), Region(0, 0, 640, 480), 100, SIGMA_PX)
+    assert len(found) == 0
+    assert found.information.shape == (0, 2, 2)
 
 
 def test_frames_are_averaged_in_grey() -> None:

@@ -15,6 +15,8 @@ from rig_protocol.frames import ImageU8
 PIXEL_MM = 0.5
 A3_SHAPE = (772, 554)  # the printed part of a sheet
 FOCAL_PX = 525.0
+SIGMA_PX = 0.25
+SHARE_OF_SCALE = 0.05  # to which a keypoint is placed
 FRAME_PX = 30  # of plain wall around the sheet
 
 
@@ -31,7 +33,7 @@ def seen_from(distance_m: float, raster: ImageU8) -> ImageU8:
 
 def keypoints_on_sheet(image: ImageU8) -> Keypoints:
     height, width = image.shape
-    return detect(image, Region(FRAME_PX, FRAME_PX, width - FRAME_PX, height - FRAME_PX), 0)
+    return detect(image, Region(FRAME_PX, FRAME_PX, width - FRAME_PX, height - FRAME_PX), 0, SIGMA_PX)
 
 
 def band_energy(raster: ImageU8, cell_mm: float) -> float:
@@ -74,8 +76,13 @@ def test_a_sheet_is_full_of_keypoints_from_one_to_three_metres(distance_m: float
     area_px = (image.shape[0] - 2 * FRAME_PX) * (image.shape[1] - 2 * FRAME_PX)
     assert len(np.unique(keypoints.place)) > 0.012 * area_px
     assert emptiest_quarter(keypoints.pixels, image.shape) > 0.15 * len(keypoints)
-    octaves = np.floor(np.log2(keypoints.scale_px))
+    octaves = np.floor(np.log2(scales_px(keypoints)))
     assert all((octaves >= octave).sum() >= count for octave, count in ((1, 10), (2, 3)))
+
+
+def scales_px(keypoints: Keypoints) -> npt.NDArray[np.float64]:
+    """Sizes (N,) of the keypoints, by how well each is placed."""
+    return np.sqrt(1 / keypoints.information[:, 0, 0] - SIGMA_PX**2) / SHARE_OF_SCALE
 
 
 def emptiest_quarter(pixels: npt.NDArray[np.float64], shape: tuple[int, ...]) -> int:
