@@ -220,7 +220,7 @@ In the real office the camera was carried by hand: motion and the synchronisatio
 def _drift(section: Section) -> str:
     from calibration_drift import tables
 
-    return f"""Two people walk around the rig all the time; no patterns. Bar: bumps found within 60 frames with the
+    return f"""Two people walk around the rig all the time, no patterns. Bar: bumps found within 60 frames,
 camera named, no false alarm in 10,000 frames (`BENCH_FULL=1` watches all of them).
 
 {tables(section)}"""
