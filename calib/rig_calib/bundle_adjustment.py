@@ -224,7 +224,8 @@ def _descend(
 
 def _solve(system: _Reduced, free: Index, damping: float) -> Array:
     """Steps (C·S,) of the cameras' states; zero for those that are held."""
-    scale = 1.0 / np.sqrt(system.normal[free, free])
+    # A camera that nothing observes and no drawing holds has no information, no gradient, and stays.
+    scale = 1.0 / np.sqrt(np.maximum(system.normal[free, free], _LEAST_INFORMATION))
     lower = system.normal[np.ix_(free, free)] * scale[:, None] * scale
     np.fill_diagonal(lower, 1.0 + damping)
     right = system.gradient[free] * scale
