@@ -9,7 +9,9 @@ SHAPE = (240, 320)
 SHIFT_PX = np.array([1.37, -0.81])
 IDENTITY = np.eye(2)
 _RNG = np.random.default_rng(5)
-WAVES = _RNG.uniform(-0.6, 0.6, (40, 2))  # radians a pixel: ten pixels a period and more
+_ANGLES = _RNG.uniform(0, 2 * np.pi, 40)
+_PERIODS_PX = _RNG.uniform(10.0, 40.0, 40)
+WAVES = 2 * np.pi / _PERIODS_PX[:, None] * np.column_stack([np.cos(_ANGLES), np.sin(_ANGLES)])
 PHASES = _RNG.uniform(0, 2 * np.pi, 40)
 
 
