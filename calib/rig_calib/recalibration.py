@@ -104,7 +104,11 @@ def _view_of(
 
 
 def _found(local: CalibrationResult, view: CameraView) -> bool:
-    return view.camera_id in local.calibration.poses
+    """Whether measurements place the camera, not the drawing alone."""
+    if local.rig is None or view.camera_id not in local.calibration.poses:
+        return False
+    scene = local.rig.scene
+    return bool((scene.observations.camera == scene.cameras.index(view.camera_id)).any())
 
 
 def _unfound(local: CalibrationResult, known: RigCalibration, view: CameraView) -> CalibrationResult:

@@ -1,7 +1,7 @@
 """A ring of cameras that see numbered points: keypoints, disparity and matches without any image."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import numpy.typing as npt
@@ -50,6 +50,13 @@ class SyntheticCamera(ObservedCamera):
             np.where(there[:, None], seen.grid_pixels[row], np.nan),
             np.where(there, seen.sigma[row], np.nan),
         )
+
+
+    def without_depth(self) -> "SyntheticCamera":
+        """The same camera, whose depth camera delivers nothing."""
+        count = len(self.keypoints)
+        nothing = _no_depth(count)
+        return replace(self, depth=nothing, points=np.full((count, 3), np.nan), seen_depth=nothing)
 
 
 def _no_depth(count: int) -> KeypointDepth:
@@ -101,7 +108,7 @@ class SyntheticRig:
         seed: int = 0,
         only: Sequence[int] | npt.NDArray[np.intp] | None = None,
         drawn: bool = True,
-    ) -> ObservedCamera:
+    ) -> SyntheticCamera:
         """Keypoints of the points (or `only` some of them) that a camera sees, with noise."""
         rng = np.random.default_rng([seed, camera])
         numbers = np.arange(self.points) if only is None else np.asarray(only)

@@ -52,7 +52,8 @@ class Capture:
 
     def _observe(self, view: CameraView, *_: object) -> ObservedCamera:
         only = np.arange(0) if view.camera_id in self.hidden else None
-        return self.rig.observe(view.camera_id, 0.25, 0.3, self._captures, only, self.drawn)
+        seen = self.rig.observe(view.camera_id, 0.25, 0.3, self._captures, only, self.drawn)
+        return replace(seen, view=view)
 
 
 @pytest.fixture
@@ -129,7 +130,8 @@ def test_a_camera_turned_to_where_its_old_overlaps_are_not_is_found_too(capture:
     assert off_mm < 12.0
 
 
-def test_a_camera_that_could_not_be_placed_is_added(capture: Capture) -> None:
+def test_a_camera_that_could_not_be_placed_is_added(monkeypatch: pytest.MonkeyPatch) -> None:
+    capture = Capture(monkeypatch, drawn=False)
     capture.hidden = {MOVED}
     known = capture.calibrate()
     assert known.camera(MOVED) is None
@@ -139,6 +141,19 @@ def test_a_camera_that_could_not_be_placed_is_added(capture: Capture) -> None:
     assert MOVED in found.poses
     assert [camera.id for camera in found.cameras] == sorted(found.poses)
     assert not any(f"camera {MOVED} " in failure for failure in found.failures)
+
+
+def test_a_camera_that_only_the_drawing_placed_is_found(capture: Capture) -> None:
+    capture.hidden = {MOVED}
+    known = capture.calibrate()
+    assert any(f"cameras {MOVED} and {MOVED + 1}" in failure for failure in known.failures)
+    capture.hidden = set()
+    found = capture.recalibrate(known).calibration
+    before, after = known.camera(MOVED), found.camera(MOVED)
+    assert before is not None
+    assert after is not None
+    assert before.T_rig_camera.tobytes() != after.T_rig_camera.tobytes()
+    assert squared_error(found, capture.rig, MOVED, MOVED + 1) < CONSISTENT
 
 
 def test_a_second_camera_that_moved_is_named(capture: Capture) -> None:

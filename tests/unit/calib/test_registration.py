@@ -1,6 +1,7 @@
 """Relative poses of pairs: alignment, RANSAC, the paper's Gauss-Newton."""
 
 import numpy as np
+import pytest
 
 from rig_calib.registration import (
     Side,
@@ -108,10 +109,27 @@ def test_matches_of_chance_give_no_pose() -> None:
 
 
 def test_two_matches_with_depth_give_no_pose() -> None:
-    i, j, _ = sides()
-    points = np.full_like(i.points, np.nan)
-    points[:2] = i.points[:2]
-    assert ransac(Side(COLOR, i.pixels, points), j, Tolerance(), np.random.default_rng(0), 8) is None
+    few_i, few_j = (with_few_points(side, kept=2) for side in sides()[:2])
+    assert ransac(few_i, few_j, Tolerance(), np.random.default_rng(0), 8) is None
+
+
+@pytest.mark.parametrize("depthless", ["i", "j"])
+def test_depth_of_one_camera_and_pixels_of_the_other_give_the_pose(depthless: str) -> None:
+    i, j, truth = sides(outliers=0.3)
+    i, j = (with_few_points(i), j) if depthless == "i" else (i, with_few_points(j))
+    found = ransac(i, j, Tolerance(), np.random.default_rng(0), 8)
+    assert found is not None
+    deg, mm = pose_distance(found[0], inverse(RIG.truth[0]) @ RIG.truth[1])
+    assert deg < 0.6
+    assert mm < 25.0
+    assert found[1][truth].mean() > 0.9
+    assert found[1][~truth].mean() < 0.05
+
+
+def with_few_points(side: Side, kept: int = 0) -> Side:
+    points = np.full_like(side.points, np.nan)
+    points[:kept] = side.points[:kept]
+    return Side(COLOR, side.pixels, points)
 
 
 def test_a_match_of_the_right_pixel_and_the_wrong_depth_does_not_agree() -> None:

@@ -2,6 +2,7 @@
 
 import json
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -24,7 +25,7 @@ def rig(monkeypatch: pytest.MonkeyPatch) -> SyntheticRig:
     rig = SyntheticRig(cameras=3)
 
     def observe(view: CameraView, *_: object) -> ObservedCamera:
-        return rig.observe(view.camera_id, 0.25, 0.3)
+        return replace(rig.observe(view.camera_id, 0.25, 0.3), view=view)
 
     monkeypatch.setattr(pipeline, "observe", observe)
     return rig
