@@ -41,6 +41,7 @@ _NEAR = 0.003  # relative decrease of the cost to be expected
 _MAX_ITERATIONS = 40
 _CONVERGED = 1e-3  # the decrease expected; one standard deviation costs a half
 _FIRST_DAMPING, _LEAST_DAMPING, _MAX_DAMPING = 1e-6, 1e-12, 1e8
+_LEAST_INFORMATION = 1e-12
 # From here on, 40 cameras or so, a ring is solved faster as a sparse system.
 _MANY_STATES = 1000
 
