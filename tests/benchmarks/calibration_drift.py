@@ -52,7 +52,6 @@ def bumped_room(seed: int) -> list[Bump]:
                 watch.take(looks[frame] | {camera: look_of(kinect, frame)})
                 if (moved := watch.status().moved) and told["frames"] is None:
                     told["named"] = [one.camera for one in moved]
-                    # The look's own frame has come, too.
                     told["frames"] = frame - bump_frame + 1
                 if camera in {one.camera for one in moved}:
                     last = next(one for one in moved if one.camera == camera)
@@ -67,34 +66,28 @@ def quiet_room(task: tuple[int, int]) -> dict[str, Any]:
     room = DriftRoom(seed, PEOPLE)
     watch = room.watch()
     alarms: dict[int, str | None] = {}
-    seconds = 0.0
-    judged = []
+    seconds, judged = [], []
     for frame in watched_frames(0, frames):
         looks = room.looks(frame)
         began = time.process_time()
         watch.take(looks)
         status = watch.status()
-        seconds += time.process_time() - began
         alarms |= {one.camera: one.found_by for one in status.moved}
         if frame > LEARNT_FRAMES:
-            judged.append(sum(one.state == "in place" for one in status.cameras) / CAMERAS)
+            seconds.append(time.process_time() - began)
+            judged.append(len(status.judged) / CAMERAS)
     return {
         "seed": seed,
         "frames": frames,
         "alarms": alarms,
-        "seconds": seconds,
-        "looks": len(watched_frames_list(frames)),
+        "look_s": statistics.mean(seconds),
         "judged": statistics.mean(judged),
     }
 
 
-def watched_frames_list(frames: int) -> Sequence[int]:
-    """All frames that are looked at."""
-    return list(watched_frames(0, frames))
-
-
 def run(full: bool) -> dict[str, Any]:
     """All of it, on two processes; prints the tables. The figures for `build/bench.json`."""
+    # Read when the processes start.
     for variable in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
         os.environ[variable] = "1"
     with get_context("spawn").Pool(PROCESSES, initializer=_one_thread) as pool:
@@ -102,7 +95,7 @@ def run(full: bool) -> dict[str, Any]:
         tasks = [(seed, QUIET_FRAMES[full]) for seed in QUIET_ROOMS]
         quiet = list(pool.imap(quiet_room, tasks))
     figures = {"bumps": [_summary(name, bumps) for name, _, _ in BUMPS], **_quiet_summary(quiet)}
-    print(_tables(figures))
+    print(tables(figures))
     for one in bumps:
         if one["named"] != [one["camera"]]:
             print(f"  {one}")
@@ -139,11 +132,12 @@ def _quiet_summary(quiet: Sequence[dict[str, Any]]) -> dict[str, Any]:
         "frames": sum(room["frames"] for room in quiet),
         "false_alarms": sum(len(room["alarms"]) for room in quiet),
         "judged": statistics.mean(room["judged"] for room in quiet),
-        "look_ms": 1e3 * sum(room["seconds"] for room in quiet) / sum(room["looks"] for room in quiet),
+        "look_ms": 1e3 * statistics.mean(room["look_s"] for room in quiet),
     }
 
 
-def _tables(figures: dict[str, Any]) -> str:
+def tables(figures: dict[str, Any]) -> str:
+    """Bumps found and rooms watched in peace, as Markdown."""
     rows = [
         [
             one["bump"],

@@ -59,6 +59,7 @@ _REFERENCE_ROWS: Sequence[tuple[str, Callable[[Section], str], str]] = (
     ("RMS error of neighbours", lambda one: _both(one, "rmse_"), ""),
     ("Cramér-Rao bound of that", lambda one: _both(one, "bound_"), ""),
     ("efficiency", lambda one: f"{one['efficiency_deg']:.2f} / {one['efficiency_mm']:.2f}", "≥ 0.7"),
+    ("bound of its own points", lambda one: _both(one, "bound_of_tracks_"), ""),
     ("bound of the images", lambda one: _both(one, "bound_of_images_"), ""),
     ("mean error of opposite cameras", lambda one: _both(one, "opposite_"), ""),
     ("... over that of neighbours", lambda one: f"{one['opposite_ratio']:.2f}", "≤ 2"),
@@ -217,15 +218,12 @@ In the real office the camera was carried by hand: motion and the synchronisatio
 
 
 def _drift(section: Section) -> str:
-    return markdown_table(["", "figure"], [[key, _shown(value)] for key, value in section.items()])
+    from calibration_drift import tables
 
+    return f"""Two people walk around the rig all the time, no patterns. Bar: bumps found within 60 frames,
+camera named, no false alarm in 10,000 frames (`BENCH_FULL=1` watches all of them).
 
-def _shown(value: Any) -> str:
-    if isinstance(value, float):
-        return f"{value:.4g}"
-    if isinstance(value, Mapping):
-        return ", ".join(f"{key} {_shown(one)}" for key, one in value.items())
-    return ", ".join(map(_shown, value)) if isinstance(value, list) else str(value)
+{tables(section)}"""
 
 
 def _pose_graph(section: Section) -> str:

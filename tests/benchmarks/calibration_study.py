@@ -24,11 +24,12 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from calibration_scenarios import SCENARIOS
 from calibration_summary import BoundedTrial, Efficiency, summary
-from calibration_trial import run_trial
+from calibration_trial import judge
 
+from rig_calib.calibration import calibrate
 from rig_calib.settings import CalibrationSettings
 from support.rendered_rig import rendered_rig
-from support.scene_bound import scene_bound
+from support.scene_bound import scene_bound, track_bound
 
 Bounded = Literal["always", "refused", "never"]
 Item = TypeVar("Item")
@@ -70,9 +71,12 @@ def _trial(
     chosen = SCENARIOS[scenario]
     rig = rendered_rig(chosen.settings(seed), frames)
     with chosen.disturbed(seed):
-        trial = run_trial(seed, rig.views, rig.ring, rig.truth, settings)
-    wanted = bounded == "always" or (bounded == "refused" and bool(trial.failures))
-    return BoundedTrial(trial, scene_bound(rig) if wanted else None)
+        result = calibrate(rig.views, rig.ring, settings or CalibrationSettings())
+    trial = judge(seed, result, rig.views, rig.truth)
+    if bounded == "always" and result.rig is not None:
+        return BoundedTrial(trial, scene_bound(rig), track_bound(rig, result.rig.scene))
+    refused = bounded == "refused" and bool(trial.failures)
+    return BoundedTrial(trial, scene_bound(rig) if refused else None)
 
 
 def _line(one: BoundedTrial) -> str:
@@ -100,6 +104,7 @@ def report(done: Sequence[BoundedTrial]) -> str:
         lines += [
             f"RMSE edge  {figures['rmse_deg']:.4f}° {figures['rmse_mm']:.3f} mm",
             f"bound      {figures['bound_deg']:.4f}° {figures['bound_mm']:.3f} mm",
+            f"of tracks  {figures['bound_of_tracks_deg']:.4f}° {figures['bound_of_tracks_mm']:.3f} mm",
             f"of images  {figures['bound_of_images_deg']:.4f}° {figures['bound_of_images_mm']:.3f} mm",
             f"efficiency {figures['efficiency_deg']:.3f} {figures['efficiency_mm']:.3f}",
         ]

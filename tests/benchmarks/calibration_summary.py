@@ -1,11 +1,11 @@
 """Several trials together: errors, efficiency and consistency."""
 
-from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
-from calibration_trial import Consistency, Trial
+from calibration_trial import Consistency, Pair, Trial
 from scipy import stats
 
 from support.scene_bound import SceneBound
@@ -16,10 +16,11 @@ Both = tuple[float, float]
 
 @dataclass(frozen=True, slots=True)
 class BoundedTrial:
-    """A trial, and what no estimator can do better in its scene."""
+    """A trial, and what no estimator can do better in its scene, or with the points that it followed."""
 
     trial: Trial
     bound: SceneBound | None
+    of_tracks: Mapping[Pair, Both] = field(default_factory=dict)
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,18 +52,21 @@ class Efficiency:
 
     rmse: Both
     bound: Both
+    of_tracks: Both
     of_images: Both
 
     @classmethod
     def of(cls, done: Sequence[BoundedTrial]) -> "Efficiency | None":
         """Over trials that have all their edges and a bound."""
-        known = [(one.trial, one.bound) for one in done if one.bound is not None and one.trial.edges]
+        known = [(one, one.bound) for one in done if one.bound is not None and one.of_tracks]
         if not known:
             return None
-        errors = [(error.deg, error.mm) for trial, _ in known for error in trial.edges.values()]
-        least = [bound.neighbours[pair] for trial, bound in known for pair in trial.edges]
-        of_images = [bound.of_images[pair] for trial, bound in known for pair in trial.edges]
-        return cls(rms(errors), rms(least), rms(of_images))
+        return cls(
+            rmse=rms(edge_errors([one.trial for one, _ in known])),
+            bound=rms([bound.neighbours[pair] for one, bound in known for pair in one.trial.edges]),
+            of_tracks=rms([one.of_tracks[pair] for one, _ in known for pair in one.trial.edges]),
+            of_images=rms([bound.of_images[pair] for one, bound in known for pair in one.trial.edges]),
+        )
 
     @property
     def deg(self) -> float:
@@ -146,6 +150,8 @@ def _efficiency(done: Sequence[BoundedTrial]) -> dict[str, Any]:
         "rmse_mm": known.rmse[1],
         "bound_deg": known.bound[0],
         "bound_mm": known.bound[1],
+        "bound_of_tracks_deg": known.of_tracks[0],
+        "bound_of_tracks_mm": known.of_tracks[1],
         "bound_of_images_deg": known.of_images[0],
         "bound_of_images_mm": known.of_images[1],
         "keypoint_sigma_px": float(np.mean([bound.keypoint_sigma_px for bound in bounds])),

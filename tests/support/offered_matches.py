@@ -12,10 +12,12 @@ import cv2
 import numpy as np
 import numpy.typing as npt
 import scipy.optimize
+import scipy.spatial
 
 from rig_agent.simulator.ring import VirtualRig
 from rig_agent.simulator.scene import Scene
 from rig_agent.simulator.units import VirtualUnit, draw_unit
+from rig_calib.tracks import Scene as TrackScene
 from rig_calib.view import CameraView
 from rig_protocol.poses import Pose, inverse, transform_points
 from support.rendered_rig import RenderedRig
@@ -28,6 +30,7 @@ Sigmas = tuple[Array, Array]
 """Noise (N,) of one coordinate of each match's pixel in the first and in the second camera."""
 
 _TRUE_WITHIN_PX = 3.0  # of where it belongs: what is further off is another thing that looks alike
+_SHARED_PATCH_PX = 10.0
 _SAME_SURFACE = 0.01  # relative depth by which the other camera may see something else and no occluder
 
 
@@ -119,6 +122,29 @@ def keypoint_noise(matches: Sequence[Matches]) -> KeypointNoise:
     return KeypointNoise(*np.exp(best.x).tolist())
 
 
+def track_matches(true: TrueRig, scene: TrackScene) -> dict[Pair, Matches]:
+    """What an estimator made of the capture: the points that it followed in two neighbours, with true errors.
+
+    Pixels that are known in both directions; of points so near each other that their patches share an error,
+    one. Scales of 1, so that all have one noise.
+    """
+    seen, found = scene.observations, {}
+    known = np.flatnonzero(np.isfinite(seen.pixel_sigma))
+    for i, j in true.rig.settings.overlaps:
+        a, b = (known[seen.camera[known] == scene.cameras.index(c)] for c in (i, j))
+        _, first, second = np.intersect1d(seen.point[a], seen.point[b], return_indices=True)
+        pixels = seen.pixels[a[first]], seen.pixels[b[second]]
+        points, expected = _seen_by_other(true, pixels[0], i, j)
+        errors = pixels[1] - expected
+        right = np.flatnonzero((np.abs(errors) < _TRUE_WITHIN_PX).all(axis=1))
+        right = right[_apart(pixels[0][right], _SHARED_PATCH_PX)]
+        ones = np.ones(len(right))
+        found[i, j] = Matches(
+            (pixels[0][right], pixels[1][right]), (ones, ones), points[right], errors[right]
+        )
+    return found
+
+
 @dataclass(frozen=True, eq=False)
 class _Keypoints:
     pixels: Array
@@ -177,6 +203,15 @@ def _seen_by_other(true: TrueRig, pixels: Array, i: int, j: int) -> tuple[Array,
     visible = np.abs(z / there[ahead, 2] - 1) < _SAME_SURFACE
     expected[ahead[visible]] = seen[visible]
     return points, expected
+
+
+def _apart(pixels: Array, distance_px: float) -> Index:
+    """Rows of which no two are nearer than a distance; the earlier row stays."""
+    dropped: set[int] = set()
+    for a, b in sorted(scipy.spatial.KDTree(pixels).query_pairs(distance_px)):
+        if a not in dropped:
+            dropped.add(b)
+    return np.array(sorted(set(range(len(pixels))) - dropped), dtype=np.intp)
 
 
 def _one_a_place(a: Array, b: Array) -> Index:

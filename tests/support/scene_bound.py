@@ -6,9 +6,10 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from rig_calib.tracks import Scene as TrackScene
 from support.cramer_rao import Bound, cramer_rao
 from support.image_information import image_sigmas
-from support.offered_matches import Pair, TrueRig, keypoint_noise, offered_matches
+from support.offered_matches import Pair, TrueRig, keypoint_noise, offered_matches, track_matches
 from support.rendered_rig import RenderedRig, code_hash
 
 _HERE = Path(__file__).parent
@@ -41,6 +42,15 @@ def scene_bound(rig: RenderedRig) -> SceneBound:
     stored = json.loads(path.read_text())
     pairs = {name: _with_pairs(stored[name]) for name in ("neighbours", "opposite", "of_images", "matches")}
     return SceneBound(**pairs, keypoint_sigma_px=stored["keypoint_sigma_px"])
+
+
+def track_bound(rig: RenderedRig, scene: TrackScene) -> dict[Pair, tuple[float, float]]:
+    """Least RMS errors of the neighbours from the points that an estimator followed, placed as it did."""
+    true = TrueRig.of(rig)
+    matches = track_matches(true, scene)
+    noise = keypoint_noise(list(matches.values()))
+    bound = cramer_rao(true, matches, {pair: noise.sigmas(found) for pair, found in matches.items()})
+    return _with_pairs(_each(bound, rig.settings.overlaps))
 
 
 def _compute(rig: RenderedRig) -> dict[str, Any]:
