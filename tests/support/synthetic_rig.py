@@ -51,7 +51,6 @@ class SyntheticCamera(ObservedCamera):
             np.where(there, seen.sigma[row], np.nan),
         )
 
-
     def without_depth(self) -> "SyntheticCamera":
         """The same camera, whose depth camera delivers nothing."""
         count = len(self.keypoints)

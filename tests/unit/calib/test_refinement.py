@@ -1,4 +1,4 @@
-"""Patches of two simulated neighbours against the simulator's truth, and what takes their place without any."""
+"""Patches of two simulated neighbours against the truth, and what takes their place without any."""
 
 from collections.abc import Mapping
 from dataclasses import replace
@@ -32,7 +32,7 @@ SETTINGS = SimulatorSettings(
 PAIR = (0, 1)
 PREDICTION_PX = {PAIR: 0.5}
 NO_CORRECTION = {0: None, 1: None}
-# A degree and a half of pixel off: what a first estimate leaves.
+# What a first estimate leaves: about a pixel.
 OFF = se3_exp(np.array([0.001, 0.0015, -0.001, 0.001, 0.0, 0.001]))
 Regions = dict[tuple[int, int], tuple[Region, Region]]
 
@@ -79,7 +79,7 @@ def true_pixels(pixels: np.ndarray, source: int, target: int) -> np.ndarray:
 
 
 def textured_errors_px(rig: RefinedRig) -> np.ndarray:
-    """Errors (N,2) of the patches that were found in both directions, by the truth about their source."""
+    """Errors (N,2) of the patches that are known across and along, by the truth about their source."""
     keypoints = [rig.cameras[c].keypoints for c in PAIR]
     ends = [side.pixels[rows] for side, rows in zip(keypoints, rig.matches[PAIR].T, strict=True)]
     known = [
@@ -103,14 +103,14 @@ def test_patches_lie_within_a_tenth_of_a_pixel_of_the_truth(refined: RefinedRig)
 
 
 def test_the_start_was_off_by_more_than_the_patches_are(
-    refined: RefinedRig, cameras: Mapping[int, ObservedCamera], regions: Regions
+    cameras: Mapping[int, ObservedCamera], regions: Regions
 ) -> None:
     """The yardstick itself: without alignment the same places are predicted far worse."""
     predicted = refine(cameras, regions, poses_off(), NO_CORRECTION, PREDICTION_PX, {PAIR})
     rows = predicted.matches[PAIR]
     a, b = (predicted.cameras[c].keypoints.pixels for c in PAIR)
-    first_half = predicted.cameras[1].keypoints.information[rows[:, 1]].any(axis=(1, 2))
-    start = b[rows[~first_half, 1]] - true_pixels(a[rows[~first_half, 0]], 0, 1)
+    from_second = predicted.cameras[1].keypoints.information[rows[:, 1]].any(axis=(1, 2))
+    start = b[rows[~from_second, 1]] - true_pixels(a[rows[~from_second, 0]], 0, 1)
     assert np.median(np.linalg.norm(start, axis=1)) > 0.5
 
 
@@ -120,9 +120,7 @@ def test_pairs_of_depth_only_carry_no_pixel_information(
     """One end defines the point, the other is compared by depth alone."""
     found = refine(cameras, regions, poses_off(), NO_CORRECTION, PREDICTION_PX, {PAIR})
     rows = found.matches[PAIR]
-    ends = np.column_stack(
-        [found.cameras[c].keypoints.has_place[rows[:, k]] for k, c in enumerate(PAIR)]
-    )
+    ends = np.column_stack([found.cameras[c].keypoints.has_place[rows[:, k]] for k, c in enumerate(PAIR)])
     assert len(rows) > 100
     assert (ends.sum(axis=1) == 1).all()
     assert all(found.cameras[c].depth.known.mean() > 0.5 for c in PAIR)
@@ -180,9 +178,7 @@ def test_keypoint_matches_do_not_join_a_pair_that_has_patches(
     np.testing.assert_array_equal(found.matches[PAIR], refined.matches[PAIR])
 
 
-def test_a_blank_image_leaves_depth_alone(
-    cameras: Mapping[int, ObservedCamera], regions: Regions
-) -> None:
+def test_a_blank_image_leaves_depth_alone(cameras: Mapping[int, ObservedCamera], regions: Regions) -> None:
     blank = {c: replace(camera, image=np.full_like(camera.image, 90.0)) for c, camera in cameras.items()}
     found = refine(blank, regions, poses_off(), NO_CORRECTION, PREDICTION_PX)
     rows = found.matches[PAIR]

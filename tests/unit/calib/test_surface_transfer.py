@@ -41,9 +41,7 @@ def measured_on_wall(points: np.ndarray, factor: np.ndarray | float = 1.0) -> Ke
         depth_m = (1.0 - PLANE @ origin) / (turned @ PLANE)
         return disparity_of_depth(GRID.raw_model, depth_m / factor)
 
-    slope = np.column_stack(
-        [(disparity(at + step) - disparity(at - step)) / 2 for step in np.eye(2)]
-    )
+    slope = np.column_stack([(disparity(at + step) - disparity(at - step)) / 2 for step in np.eye(2)])
     return KeypointDepth(disparity(at), slope, at, np.full(len(points), 0.3))
 
 
