@@ -83,6 +83,7 @@ def _record(name: str, bounded: Sequence[BoundedTrial], reference: Both) -> dict
                 "outcome": what,
                 "deg": trial.deg,
                 "mm": trial.mm,
+                "worst_nees": max(trial.edge_nees.values(), default=None),
                 "failures": list(trial.failures),
             }
             for trial, what in zip(done, outcomes, strict=True)
