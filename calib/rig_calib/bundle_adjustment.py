@@ -41,6 +41,7 @@ _NEAR = 0.003  # relative decrease of the cost to be expected
 _MAX_ITERATIONS = 40
 _CONVERGED = 1e-3  # the decrease expected; one standard deviation costs a half
 _FIRST_DAMPING, _LEAST_DAMPING, _MAX_DAMPING = 1e-6, 1e-12, 1e8
+_LEAST_INFORMATION = 1e-12
 # From here on, 40 cameras or so, a ring is solved faster as a sparse system.
 _MANY_STATES = 1000
 
@@ -224,7 +225,8 @@ def _descend(
 
 def _solve(system: _Reduced, free: Index, damping: float) -> Array:
     """Steps (C·S,) of the cameras' states; zero for those that are held."""
-    scale = 1.0 / np.sqrt(system.normal[free, free])
+    # A camera that nothing observes and no drawing holds has no information, no gradient, and stays.
+    scale = 1.0 / np.sqrt(np.maximum(system.normal[free, free], _LEAST_INFORMATION))
     lower = system.normal[np.ix_(free, free)] * scale[:, None] * scale
     np.fill_diagonal(lower, 1.0 + damping)
     right = system.gradient[free] * scale

@@ -56,9 +56,10 @@ def obstacle(views: Mapping[int, CameraView], regions: Mapping[int, Region]) -> 
     `regions` are the two parts of the overlap by camera id.
     """
     for camera_id in regions:
-        absent = _absent_images(views[camera_id])
+        view = views[camera_id]
+        absent = missing_images(view) or (None if view.raw or view.depth_mm else "no depth image")
         if absent is not None:
-            return f"{views[camera_id].name} delivers {absent}: see that it streams"
+            return f"{view.name} delivers {absent}: see that it streams"
     sides = {camera_id: survey(views[camera_id], region) for camera_id, region in regions.items()}
     for camera_id, side in sides.items():
         told = _fault(views[camera_id].name, side)
@@ -71,12 +72,6 @@ def obstacle(views: Mapping[int, CameraView], regions: Mapping[int, Region]) -> 
             f"{views[far].name} sees: move it"
         )
     return None
-
-
-def _absent_images(view: CameraView) -> str | None:
-    """What a view lacks; without depth it may be placed all the same, but that may be why support is poor."""
-    no_depth = None if view.raw or view.depth_mm else "no depth image"
-    return missing_images(view) or no_depth
 
 
 def _fault(name: str, side: OverlapSide) -> str | None:

@@ -11,7 +11,7 @@ from support.benchmark_record import machine, markdown_table
 from support.pictures import picture
 
 _BLUE, _ORANGE, _GREEN, _RED, _GREY = "#4477aa", "#ee8866", "#44bb99", "#cc3311", "#bbbbbb"
-_OUTCOME_COLORS = dict(zip(OUTCOMES, (_GREEN, _BLUE, _ORANGE, "#aa3377", _RED), strict=True))
+_OUTCOME_COLORS = dict(zip(OUTCOMES, (_GREEN, _BLUE, _ORANGE, "#aa3377", _RED, "black"), strict=True))
 _REFERENCE = {"one_frame": "1 frame", "ten_frames": "10 frames"}
 
 Section = Any

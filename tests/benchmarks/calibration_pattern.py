@@ -64,7 +64,10 @@ def count_room(seed: int, patterns: bool) -> dict[str, float]:
     models = {camera.id: camera.model.color for camera in description.cameras}
     nominal = {camera.id: camera.T_rig_camera for camera in description.cameras}
     overlaps = shared_regions(models, nominal, OVERLAP_MARGIN_DEG)
-    keypoints = {i: detect(grey_image(rig.camera(i)), whole_image(models[i]), ALL_KEYPOINTS) for i in models}
+    sigma_px = CalibrationSettings().pixel_sigma
+    keypoints = {
+        i: detect(grey_image(rig.camera(i)), whole_image(models[i]), ALL_KEYPOINTS, sigma_px) for i in models
+    }
     counts: list[dict[str, float]] = []
     for i, j in (tuple(sorted(pair)) for pair in settings.overlaps):
         regions = {"whole image": (whole_image(models[i]), whole_image(models[j])), "overlap": overlaps[i, j]}

@@ -29,12 +29,15 @@ OUTCOMES: Mapping[str, str] = {
     "refused_solvable": "refused what can be solved",
     "refused_badly": "refused, σ or edges wrong",
     "wrong": "silently wrong",
+    "crashed": "crashed",
 }
 
 
 def outcome(one: BoundedTrial, reference: Both) -> str:
     """Which of OUTCOMES a trial is; `reference` is the mean edge error of the untroubled scene."""
     trial = one.trial
+    if trial.crashed:
+        return "crashed"
     whole = bool(trial.edges) and not trial.missing
     close = whole and _within((trial.deg, trial.mm), reference, _TIMES_REFERENCE)
     if not trial.failures:

@@ -10,9 +10,11 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from calibration_trial import Trial, run_trial
+from calibration_trial import Trial, judge
 
+from rig_calib.calibration import calibrate
 from rig_calib.rig_folder_calibration import read_views
+from rig_calib.settings import CalibrationSettings
 from rig_protocol.rig_folder import read_rig_description, read_true_poses
 from support.real_data import real_data
 
@@ -44,8 +46,9 @@ def _measure(room: Room) -> dict[str, Any]:
     folder = real_data(room.folder)
     description = read_rig_description(folder)
     truth = read_true_poses(folder / "truth.json")
-    trial = run_trial(0, read_views(folder, description, room.frames), description.ring, truth)
-    return {"case": room.title, **_figures(trial)}
+    views = read_views(folder, description, room.frames)
+    result = calibrate(views, description.ring, CalibrationSettings())
+    return {"case": room.title, **_figures(judge(0, result, views, truth))}
 
 
 def _figures(trial: Trial) -> dict[str, Any]:

@@ -24,7 +24,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from calibration_scenarios import SCENARIOS
 from calibration_summary import BoundedTrial, Efficiency, summary
-from calibration_trial import judge
+from calibration_trial import crash, judge
 
 from rig_calib.calibration import calibrate
 from rig_calib.settings import CalibrationSettings
@@ -70,8 +70,11 @@ def _trial(
 ) -> BoundedTrial:
     chosen = SCENARIOS[scenario]
     rig = rendered_rig(chosen.settings(seed), frames)
-    with chosen.disturbed(seed):
-        result = calibrate(rig.views, rig.ring, settings or CalibrationSettings())
+    try:
+        with chosen.disturbed(seed):
+            result = calibrate(rig.views, rig.ring, settings or CalibrationSettings())
+    except Exception as error:
+        return BoundedTrial(crash(seed, error), None)
     trial = judge(seed, result, rig.views, rig.truth)
     if bounded == "always" and result.rig is not None:
         return BoundedTrial(trial, scene_bound(rig), track_bound(rig, result.rig.scene))
@@ -112,8 +115,8 @@ def report(done: Sequence[BoundedTrial]) -> str:
         if key in figures:
             low, high = figures[f"{key}_low"], figures[f"{key}_high"]
             lines.append(f"NEES/dof   {figures[key]:.3f} {name} (95 %: {low:.3f} to {high:.3f})")
-    stages = done[0].trial.seconds
-    seconds = {stage: np.mean([one.trial.seconds[stage] for one in done]) for stage in stages}
+    whole = [one.trial for one in done if not one.trial.crashed]
+    seconds = {stage: np.mean([trial.seconds[stage] for trial in whole]) for stage in whole[0].seconds}
     lines.append("seconds " + ", ".join(f"{stage} {value:.3f}" for stage, value in seconds.items()))
     lines.append(f"not worse than the drawing: {100 * figures['not_worse_than_drawing']:.0f} %")
     return "\n".join(lines)

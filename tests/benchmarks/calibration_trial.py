@@ -6,13 +6,11 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from rig_calib.calibration import CalibrationResult, calibrate
+from rig_calib.calibration import CalibrationResult
 from rig_calib.evaluation import Evaluation, PoseError, evaluate
 from rig_calib.rig_adjustment import AdjustedRig
-from rig_calib.settings import CalibrationSettings
 from rig_calib.view import CameraView
 from rig_protocol.poses import Pose, adjoint, inverse, se3_log
-from rig_protocol.rig_folder import RingDrawing
 
 Array = npt.NDArray[np.float64]
 Pair = tuple[int, int]
@@ -48,6 +46,7 @@ class Trial:
     cameras_nees: Consistency | None
     edge_nees: Mapping[Pair, float]
     matches: int
+    crashed: bool = False
 
     @property
     def deg(self) -> float:
@@ -60,15 +59,25 @@ class Trial:
         return float(np.mean([error.mm for error in self.edges.values()])) if self.edges else np.nan
 
 
-def run_trial(
-    seed: int,
-    views: Sequence[CameraView],
-    ring: RingDrawing | None,
-    truth: Mapping[int, Pose],
-    settings: CalibrationSettings | None = None,
-) -> Trial:
-    """Calibrate once and judge the result by the truth."""
-    return judge(seed, calibrate(views, ring, settings or CalibrationSettings()), views, truth)
+def crash(seed: int, error: Exception) -> Trial:
+    """The trial of a calibration that raised, which none should."""
+    return Trial(
+        seed=seed,
+        seconds={"total": np.nan},
+        failures=(f"it crashed: {error!r}",),
+        warnings=(),
+        missing=(),
+        edges={},
+        near=(),
+        opposite=(),
+        absolute_mm=np.nan,
+        nominal_mm=np.nan,
+        pairs_nees=None,
+        cameras_nees=None,
+        edge_nees={},
+        matches=0,
+        crashed=True,
+    )
 
 
 def judge(
