@@ -12,7 +12,7 @@ from rig_calib.evaluation import evaluate
 from rig_calib.observed_camera import ObservedCamera
 from rig_calib.settings import CalibrationSettings
 from rig_calib.view import CameraView
-from rig_protocol.poses import Pose, se3_exp
+from rig_protocol.poses import Pose, se3_exp, transform_points
 from support.synthetic_rig import SyntheticCamera, SyntheticRig
 
 SETTINGS = CalibrationSettings()
@@ -200,6 +200,28 @@ def test_a_missing_overlap_is_warned_about_while_the_other_way_round_holds(solve
     assert any("edge 2–3: of 0 matches" in warning for warning in calibration.warnings)
     assert any("no loop confirms" in warning for warning in calibration.warnings)
     assert len(calibration.cameras) == 12
+
+
+def test_a_plausible_false_edge_is_dropped_with_a_reason(solve: Calibrate) -> None:
+    """What cameras 2 and 3 share hangs elsewhere for camera 3: the edge is perfect in itself, and false."""
+    rig, elsewhere = SyntheticRig(), SyntheticRig()
+    azimuth = np.arctan2(rig.world[:, 1], rig.world[:, 0])
+    shared = np.abs(azimuth - np.deg2rad(75.0)) < np.deg2rad(14.0)
+    turn = se3_exp(np.array([0.0, 0.0, np.deg2rad(6.0), 0.0, 0.0, 0.0]))
+    elsewhere.world[shared] = transform_points(turn, rig.world[shared])
+
+    def change(camera: SyntheticCamera) -> SyntheticCamera:
+        if camera.view.camera_id != 3:
+            return camera
+        return elsewhere.observe(3, pixel_sigma=0.25, disparity_sigma=0.3)
+
+    calibration = solve(rig, change=change).calibration
+    false = next(edge for edge in calibration.edges if (edge.i, edge.j) == (2, 3))
+    assert false.reason is not None
+    assert false.reason.startswith("contradicts")
+    assert not false.used
+    assert calibration.failures == ()
+    assert evaluate(calibration, rig.truth).pairs[2, 3].deg < 0.5
 
 
 def test_no_images_at_all_is_a_result_that_failed(solve: Calibrate) -> None:
