@@ -92,23 +92,26 @@ def _add_observations(
         rays = (seen.pixels[rows] - (color.cx, color.cy)) / (color.fx, color.fy)
         points = transform_points(T, np.column_stack([rays, np.ones(len(rows))]) * z_m[:, None])
         for n, row in enumerate(rows.tolist()):
-            number, (u, v), sigma = int(seen.point[row]), seen.pixels[row], seen.pixel_sigma[row]
+            number, (u, v), whitener = int(seen.point[row]), seen.pixels[row], seen.pixel_whitener[row]
             keys = gtsam.symbol("x", k), gtsam.symbol("l", number)
             if not np.isfinite(z_m[n]):
-                noise = gtsam.noiseModel.Isotropic.Sigma(2, sigma)
-                robust = gtsam.noiseModel.Robust.Create(kernel, noise)
+                robust = gtsam.noiseModel.Robust.Create(kernel, _noise(whitener))
                 graph.add(gtsam.GenericProjectionFactorCal3_S2((u, v), robust, *keys, mono))
                 continue
-            # The right image differs by the disparity, whose noise it has beside the pixel's.
-            covariance = np.full((3, 3), sigma**2) * [[1, 1, 0], [1, 1, 0], [0, 0, 1]]
-            covariance[1, 1] += seen.disparity_sigma[row] ** 2
-            noise = gtsam.noiseModel.Gaussian.Covariance(covariance)
-            robust = gtsam.noiseModel.Robust.Create(kernel, noise)
+            # Order: column, column in the right image, row. The right image differs by the disparity.
+            weight = 1 / seen.disparity_sigma[row]
+            root = np.vstack([np.insert(whitener, 1, 0.0, axis=1), [weight, -weight, 0.0]])
+            robust = gtsam.noiseModel.Robust.Create(kernel, _noise(root))
             both = gtsam.StereoPoint2(u, u - numerator / z_m[n], v)
             graph.add(gtsam.GenericStereoFactor3D(both, robust, *keys, stereo))
             if number not in started:
                 start.insert(keys[1], points[n])
                 started.add(number)
+
+
+def _noise(root: Array) -> gtsam.noiseModel.Gaussian:
+    """The noise whose square root of information this is; it may leave directions open."""
+    return gtsam.noiseModel.Gaussian.SqrtInformation(root, False)
 
 
 def _depth_in_color(
