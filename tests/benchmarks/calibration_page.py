@@ -47,6 +47,8 @@ def _reference(results: Mapping[str, Section]) -> str:
 
 
 def _both(one: Section, key: str) -> str:
+    if f"{key}deg" not in one:  # a section that was measured before there was such a figure
+        return "–"
     return f"{one[f'{key}deg']:.3f}° / {one[f'{key}mm']:.2f} mm"
 
 
