@@ -16,8 +16,8 @@ class CalibrationSettings(Settings):
     """`joint`: one adjustment of poses, points and depth bias. `paper`: pairs, then a pose graph."""
     seed: int = 0
     """Of every random choice, so that the same input gives the same result."""
-    max_keypoints: Annotated[int, Field(ge=50, le=20000)] = 1000
-    """Strongest SIFT keypoints kept of one image."""
+    max_keypoints: Annotated[int, Field(ge=50, le=20000)] = 3000
+    """Strongest SIFT keypoints kept of one image; a third of that where patches refine them (`joint`)."""
     match_ratio: Annotated[float, Field(gt=0, lt=1)] = 0.85
     """`joint`: nearest over second-nearest descriptor distance of a match."""
     match_max_distance: Positive = 250.0

@@ -25,8 +25,8 @@ from rig_calib.pose_graph.se3_batches import (
     inverse_right_jacobians,
     inverses,
     logarithms,
-    quaternions,
 )
+from rig_calib.rotations import quaternions
 from rig_protocol.poses import Pose, hat
 
 Array = npt.NDArray[np.float64]

@@ -17,7 +17,7 @@ import numpy as np
 import numpy.typing as npt
 
 from rig_calib.pose_graph.edge_batch import EdgeBatch
-from rig_calib.pose_graph.se3_batches import quaternions, rotations
+from rig_calib.rotations import quaternions, rotations_of
 from rig_calib.whole_file import whole_file
 from rig_protocol.errors import ConfigurationError, DataError
 
@@ -178,7 +178,7 @@ def _poses(numbers: Array, lines: list[int]) -> Array:
     for wrong in np.flatnonzero(np.abs(norm - 1.0) > _QUATERNION_NORM_TOLERANCE):
         raise DataError(f"line {lines[wrong]}: the quaternion's norm is {norm[wrong]:.3g}, not 1")
     T = np.tile(np.eye(4), (len(numbers), 1, 1))
-    T[:, :3, :3] = rotations(numbers[:, [6, 3, 4, 5]] / norm[:, None])
+    T[:, :3, :3] = rotations_of(numbers[:, [6, 3, 4, 5]] / norm[:, None])
     T[:, :3, 3] = numbers[:, :3]
     return T
 

@@ -6,6 +6,7 @@ Tangent vectors (N,6) are (rotation vector in rad, translation in m), applied on
 import numpy as np
 import numpy.typing as npt
 
+from rig_calib.rotations import right_jacobians, rotation_matrices, rotation_vectors
 from rig_protocol.poses import hat
 
 Array = npt.NDArray[np.float64]
@@ -36,49 +37,17 @@ def adjoints(T: Array) -> Array:
 def exponentials(delta: Array) -> Array:
     """T (N,4,4) of tangent vectors (N,6)."""
     phi, rho = delta[:, :3], delta[:, 3:]
-    angle = np.linalg.norm(phi, axis=1)
-    small = angle < _SMALL_ANGLE_RAD
-    s, theta = angle**2, np.where(small, 1.0, angle)
-    a = np.where(small, 1 - s / 6 * (1 - s / 20 * (1 - s / 42)), np.sin(theta) / theta)
-    b = np.where(small, 0.5 - s / 24 * (1 - s / 30 * (1 - s / 56)), (1 - np.cos(theta)) / theta**2)
-    c = np.where(small, 1 / 6 - s / 120 * (1 - s / 42 * (1 - s / 72)), (theta - np.sin(theta)) / theta**3)
-    K = hat(phi)
-    K_squared = K @ K
     T = np.zeros((len(delta), 4, 4))
-    T[:, :3, :3] = np.eye(3) + a[:, None, None] * K + b[:, None, None] * K_squared
-    V = np.eye(3) + b[:, None, None] * K + c[:, None, None] * K_squared
-    T[:, :3, 3] = (V @ rho[..., None])[..., 0]
+    T[:, :3, :3] = rotation_matrices(phi)
+    T[:, :3, 3] = (right_jacobians(-phi) @ rho[..., None])[..., 0]  # the left Jacobian of φ
     T[:, 3, 3] = 1.0
     return T
 
 
-def quaternions(R: Array) -> Array:
-    """Unit quaternions (N,4) as (w, x, y, z), w ≥ 0, of rotation matrices (N,3,3), at any angle."""
-    product = np.empty((len(R), 4, 4))  # 4 q qᵀ, of which the row with the largest diagonal is taken
-    trace = np.einsum("nii->n", R)
-    product[:, 0, 0] = 1.0 + trace
-    product[:, 1:, 1:] = R + R.transpose(0, 2, 1) + (1.0 - trace)[:, None, None] * np.eye(3)
-    for k, (row, column) in enumerate(((2, 1), (0, 2), (1, 0)), start=1):
-        product[:, 0, k] = product[:, k, 0] = R[:, row, column] - R[:, column, row]
-    largest = np.einsum("nii->ni", product).argmax(axis=1)
-    q = product[np.arange(len(R)), largest]
-    q = q / np.linalg.norm(q, axis=1, keepdims=True)
-    return np.asarray(np.where(q[:, :1] < 0, -q, q))
-
-
-def rotations(q: Array) -> Array:
-    """Rotation matrices (N,3,3) of unit quaternions (N,4) as (w, x, y, z)."""
-    K = hat(q[:, 1:])
-    return np.asarray(np.eye(3) + 2.0 * (q[:, 0, None, None] * K + K @ K))
-
-
 def logarithms(T: Array) -> Array:
     """Tangent vectors (N,6) of poses; the rotation's norm is at most π."""
-    q = quaternions(T[:, :3, :3])
-    sine = np.linalg.norm(q[:, 1:], axis=1)
-    angle = 2.0 * np.arctan2(sine, q[:, 0])
-    safe = np.where(sine < 1e-9, 1.0, sine)
-    phi = np.where(sine < 1e-9, 2.0, angle / safe)[:, None] * q[:, 1:]
+    phi = rotation_vectors(T[:, :3, :3])
+    angle = np.linalg.norm(phi, axis=1)
     K = hat(phi)
     V_inverse = np.eye(3) - 0.5 * K + _cotangent_terms(angle)[2][:, None, None] * (K @ K)
     return np.concatenate([phi, (V_inverse @ T[:, :3, 3:])[..., 0]], axis=1)

@@ -59,7 +59,7 @@ def test_plausible_false_pairs_are_not_believed(office: tuple[Path, CalibrationR
     assert max(errors.pairs[pair].deg for pair in errors.used) < 5.0
     used = [edge for edge in result.calibration.edges if edge.used]
     alone = [PoseError.between(edge.T_i_j, inverse(truth[edge.i]) @ truth[edge.j]) for edge in used]
-    assert max(error.deg for error in alone) < 10.0
+    assert max(error.deg for error in alone) < 5.0
 
 
 def test_solving_real_views_again_gives_bit_identical_results(

@@ -10,9 +10,8 @@ from rig_calib.pose_graph.se3_batches import (
     inverse_right_jacobians,
     inverses,
     logarithms,
-    quaternions,
-    rotations,
 )
+from rig_calib.rotations import quaternions, rotations_of
 from rig_protocol.poses import adjoint, inverse, se3_exp, se3_log
 
 Array = npt.NDArray[np.float64]
@@ -45,7 +44,7 @@ def test_quaternions_give_the_rotations_back(angle: float) -> None:
     q = quaternions(R)
     np.testing.assert_allclose(np.linalg.norm(q, axis=1), 1.0)
     assert (q[:, 0] >= 0).all()
-    np.testing.assert_allclose(rotations(q), R, atol=1e-14)
+    np.testing.assert_allclose(rotations_of(q), R, atol=1e-14)
 
 
 @pytest.mark.parametrize("angle", [angle for angle in ANGLES_RAD if angle < 3.14])
