@@ -228,8 +228,9 @@ class RigCalibration:
     @classmethod
     def load(cls, path: Path) -> "RigCalibration":
         """Read a `calibration.json`; ConfigurationError when absent, DataError when malformed."""
+        values = read_json(path)
         try:
-            return cls.from_dict(read_json(path))
+            return cls.from_dict(values)
         except DataError as error:
             raise DataError(f"{path}: {error}") from error
 

@@ -132,8 +132,9 @@ class RigDescription:
 def read_rig_description(path: Path) -> RigDescription:
     """Read `nominal.json`, given the file or its folder; ConfigurationError when there is none."""
     path = path / "nominal.json" if path.is_dir() else path
+    values = read_json(path)
     try:
-        return RigDescription.from_dict(read_json(path))
+        return RigDescription.from_dict(values)
     except DataError as error:
         raise DataError(f"{path}: {error}") from error
 

@@ -163,25 +163,25 @@ def run(
     console = Console()
     set_up_logging(settings.log_level, console)
     # What takes a second to import comes after everything that can be refused at once.
-    if calibrate:
-        from rig_calib.outputs import known_calibration, make_output_folder
-        from rig_server.calibrating import calibrate_rig
-        from rig_server.calibration_task import CalibrationTask
-
-        folder = out or Path("calibration")
-        known = known_calibration(recalibrate, calibration, folder)
-        make_output_folder(folder)
-        with _open_rig(settings, simulate, seed) as rig:
-            if recalibrate is None or known is None:
-                task = CalibrationTask.whole_rig(rig.settings, coach)
-            else:
-                task = CalibrationTask.one_camera(rig.settings, known, recalibrate, coach)
-            calibrate_rig(rig, folder, console, task)
-    else:
+    if not calibrate:
         from rig_server.receiving import receive
 
         with _open_rig(settings, simulate, seed) as rig:
             receive(rig, console)
+        return
+    from rig_calib.outputs import known_calibration, make_output_folder
+    from rig_server.calibrating import calibrate_rig
+    from rig_server.calibration_task import CalibrationTask
+
+    folder = out or Path("calibration")
+    known = known_calibration(recalibrate, calibration, folder)
+    make_output_folder(folder)
+    with _open_rig(settings, simulate, seed) as rig:
+        if recalibrate is None or known is None:
+            task = CalibrationTask.whole_rig(rig.settings, coach)
+        else:
+            task = CalibrationTask.one_camera(rig.settings, known, recalibrate, coach)
+        calibrate_rig(rig, folder, console, task)
 
 
 @app.command()

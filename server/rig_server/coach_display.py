@@ -2,8 +2,6 @@
 
 import time
 from collections.abc import Sequence
-from types import TracebackType
-from typing import Self
 
 from rich import box
 from rich.bar import Bar
@@ -16,6 +14,7 @@ from rich.text import Text
 from rig_calib.accuracy import Accuracy
 from rig_calib.coaching import PairSupport, Support
 from rig_server.calibration_task import Estimate
+from rig_server.live_panel import LivePanel
 
 _LINES_EVERY_S = 5.0
 _PLENTY = 100  # matches: more hardly make an overlap better
@@ -24,32 +23,18 @@ _STYLES = {Support.GOOD: "green", Support.WEAK: "yellow", Support.NOTHING: "bold
 _UNKNOWN = "–"
 
 
-class CoachDisplay:
+class CoachDisplay(LivePanel):
     """Shows a capture and what it is good for so far; a context manager that leaves the last on the screen.
 
     Any thread may tell it something; on a terminal it draws itself a few times a second.
     """
 
     def __init__(self, console: Console) -> None:
-        self._console = console
+        super().__init__(console, Live(console=console, get_renderable=self._render))
         self._bars: dict[str, tuple[str, float]] = {}
         self._estimate: Estimate | None = None
         self._begun = 0
         self._next_lines_s = 0.0
-        self._live = Live(console=console, get_renderable=self._render) if console.is_terminal else None
-
-    def __enter__(self) -> Self:
-        """Take over the bottom of the terminal."""
-        if self._live is not None:
-            self._live.start()
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        """Give the terminal back."""
-        if self._live is not None:
-            self._live.stop()
 
     def connected(self, cameras: int, expected: int | None) -> None:
         """So many cameras are here."""

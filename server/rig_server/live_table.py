@@ -1,8 +1,6 @@
 """The live table in the terminal; where there is no terminal, a plain line every few seconds."""
 
 import time
-from types import TracebackType
-from typing import Self
 
 from rich import box
 from rich.console import Console, Group, RenderableType
@@ -10,6 +8,7 @@ from rich.live import Live
 from rich.table import Table
 from rich.text import Text
 
+from rig_server.live_panel import LivePanel
 from rig_server.metrics import CameraMetrics, RigStatus
 from rig_server.status_words import alarms, summary
 
@@ -23,27 +22,13 @@ _CALM, _PLAIN, _TROUBLE = "dim", "", "bold not dim yellow"
 _ALARM = "bold not dim red"
 
 
-class LiveDisplay:
+class LiveDisplay(LivePanel):
     """Shows a RigStatus at every `update`; a context manager that leaves the last table on the screen."""
 
     def __init__(self, console: Console, title: str) -> None:
-        self._console = console
+        super().__init__(console, Live(console=console, auto_refresh=False))
         self._title = title
-        self._live = Live(console=console, auto_refresh=False) if console.is_terminal else None
         self._next_line_s = 0.0
-
-    def __enter__(self) -> Self:
-        """Take over the bottom of the terminal."""
-        if self._live is not None:
-            self._live.start()
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        """Give the terminal back."""
-        if self._live is not None:
-            self._live.stop()
 
     def update(self, status: RigStatus) -> None:
         """Show the newest status."""
