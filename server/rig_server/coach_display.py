@@ -30,11 +30,11 @@ class CoachDisplay(LivePanel):
     """
 
     def __init__(self, console: Console) -> None:
-        super().__init__(console, Live(console=console, get_renderable=self._render))
         self._bars: dict[str, tuple[str, float]] = {}
         self._estimate: Estimate | None = None
         self._begun = 0
         self._next_lines_s = 0.0
+        super().__init__(console, Live(console=console, get_renderable=self._render))  # which renders at once
 
     def connected(self, cameras: int, expected: int | None) -> None:
         """So many cameras are here."""
