@@ -1,5 +1,6 @@
 """Keypoints with descriptors (SIFT, Lowe 2004) of one camera's colour images."""
 
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -14,7 +15,8 @@ Array = npt.NDArray[np.float64]
 
 _BORDER_PX = 24  # SIFT looks at a neighbourhood; a cropped region brings it along
 _SAME_PLACE_PX = 0.01
-_COARSE_SHARE = 3  # half the size holds fewer keypoints, and patches need but a start
+_SPREAD_CELL_PX = 24
+_COARSE_SHARE = 6  # half the size holds fewer keypoints, and patches need but a start
 # A blob is placed to a share of its size (0.05 on two renderers' images, where nothing else is wrong).
 _POSITION_SHARE_OF_SCALE = 0.05
 
@@ -50,27 +52,32 @@ def mean_grey(images: Sequence[ImageU8]) -> ImageU8:
 
 
 def detect_coarsely(image: ImageU8, region: Region, max_keypoints: int, pixel_sigma: float) -> Keypoints:
-    """A third of the keypoints, found at half the image's size in a third of the time.
+    """A share of the keypoints, spread over the region, found at half the image's size: a quick start.
 
     The pixels are those of the whole image.
     """
     half = np.asarray(cv2.resize(image, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA), dtype=np.uint8)
     part = Region(region.left // 2, region.top // 2, (region.right + 1) // 2, (region.bottom + 1) // 2)
-    found = detect(half, part, max_keypoints // _COARSE_SHARE, pixel_sigma)
+    found = detect(half, part, max_keypoints // _COARSE_SHARE, pixel_sigma, spread=True)
     # The centre of a pixel of half the size lies between four.
     return replace(found, pixels=2.0 * found.pixels + 0.5, information=0.25 * found.information)
 
 
-def detect(image: ImageU8, region: Region, max_keypoints: int, pixel_sigma: float) -> Keypoints:
-    """The strongest SIFT keypoints of the region of a grey image, in the image's pixels.
+def detect(
+    image: ImageU8, region: Region, max_keypoints: int, pixel_sigma: float, spread: bool = False
+) -> Keypoints:
+    """The strongest SIFT keypoints of the region of a grey image, or of every part of it, in image pixels.
 
     `pixel_sigma` is the standard deviation of a small one's place, pixels; large ones are placed less well.
     """
     top, left = max(region.top - _BORDER_PX, 0), max(region.left - _BORDER_PX, 0)
     crop = np.ascontiguousarray(image[top : region.bottom + _BORDER_PX, left : region.right + _BORDER_PX])
     # Without the precise upscale OpenCV's positions are shifted by a quarter of a pixel.
-    sift = cv2.SIFT.create(nfeatures=max_keypoints, enable_precise_upscale=True)
-    found, descriptors = sift.detectAndCompute(crop, None)
+    sift = cv2.SIFT.create(nfeatures=0 if spread else max_keypoints, enable_precise_upscale=True)
+    if spread:
+        found, descriptors = sift.compute(crop, _spread(sift.detect(crop, None), max_keypoints))
+    else:
+        found, descriptors = sift.detectAndCompute(crop, None)
     if not found:
         return _no_keypoints()
     pixels = np.array([keypoint.pt for keypoint in found], dtype=np.float64)
@@ -84,6 +91,18 @@ def detect(image: ImageU8, region: Region, max_keypoints: int, pixel_sigma: floa
     variance = pixel_sigma**2 + (_POSITION_SHARE_OF_SCALE * scale_px[order]) ** 2
     information = np.eye(2) / variance[:, None, None]
     return Keypoints(pixels, information, descriptors[order].astype(np.float32), _places(pixels))
+
+
+def _spread(found: Sequence[cv2.KeyPoint], count: int) -> list[cv2.KeyPoint]:
+    """As many keypoints, the strongest of every cell before the second of any."""
+    strongest = sorted(found, key=lambda keypoint: -keypoint.response)
+    cell = np.array([keypoint.pt for keypoint in strongest]).reshape(-1, 2) // _SPREAD_CELL_PX
+    taken: Counter[tuple[float, ...]] = Counter()
+    rank = []
+    for key in map(tuple, cell.tolist()):
+        rank.append(taken[key])
+        taken[key] += 1
+    return [strongest[k] for k in np.argsort(rank, kind="stable")[:count]]
 
 
 def _places(pixels: Array) -> npt.NDArray[np.intp]:
