@@ -18,7 +18,7 @@ from rig_calib.joint_estimate import estimate_jointly
 from rig_calib.loops import closing_cycle
 from rig_calib.matching import Matches, flann_matches, mutual_matches
 from rig_calib.observed_camera import ObservedCamera, missing_images, observe
-from rig_calib.overlap import Region, shared_regions
+from rig_calib.overlap import Region, joined, shared_regions
 from rig_calib.parallel import in_threads
 from rig_calib.pose_graph import chain_poses, loop_error, optimise, spanning_tree
 from rig_calib.rig_adjustment import AdjustedRig
@@ -132,13 +132,13 @@ def _observe_all(
     stages: Stages,
 ) -> dict[int, ObservedCamera]:
     """Cameras that may share a view, observed where they may."""
-    wanted: dict[int, Region] = {}
+    wanted: dict[int, list[Region]] = {}
     for pair, sides in regions.items():
         for camera_id, region in zip(pair, sides, strict=True):
-            wanted[camera_id] = region.union(wanted.get(camera_id, region))
+            wanted.setdefault(camera_id, []).append(region)
     sharing = [view for view in views if view.camera_id in wanted]
     cameras = {}
-    observed = in_threads(lambda view: observe(view, wanted[view.camera_id], settings), sharing)
+    observed = in_threads(lambda view: observe(view, joined(wanted[view.camera_id]), settings), sharing)
     for view, camera in zip(sharing, observed, strict=True):
         cameras[view.camera_id] = camera
         stages.tell(len(cameras) / len(sharing))

@@ -1,6 +1,5 @@
 """Keypoints with descriptors (SIFT, Lowe 2004) of one camera's colour images."""
 
-from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
@@ -15,7 +14,7 @@ Array = npt.NDArray[np.float64]
 
 _BORDER_PX = 24  # SIFT looks at a neighbourhood; a cropped region brings it along
 _SAME_PLACE_PX = 0.01
-_SPREAD_CELL_PX = 24
+_TILE_PX, _LEAST_OF_TILE = 160, 60  # so many of the strongest keypoints come from every tile at least
 _COARSE_SHARE = 6  # half the size holds fewer keypoints, and patches need but a start
 # A blob is placed to a share of its size (0.05 on two renderers' images, where nothing else is wrong).
 _POSITION_SHARE_OF_SCALE = 0.05
@@ -51,33 +50,31 @@ def mean_grey(images: Sequence[ImageU8]) -> ImageU8:
     return np.rint(np.mean(np.stack(grey), axis=0, dtype=np.float64)).astype(np.uint8)
 
 
-def detect_coarsely(image: ImageU8, region: Region, max_keypoints: int, pixel_sigma: float) -> Keypoints:
-    """A share of the keypoints, spread over the region, found at half the image's size: a quick start.
+def detect_coarsely(
+    image: ImageU8, regions: Sequence[Region], max_keypoints: int, pixel_sigma: float
+) -> Keypoints:
+    """A share of the keypoints, spread over the regions, found at half the image's size: a quick start.
 
-    The pixels are those of the whole image.
+    The regions are apart. The pixels are those of the whole image.
     """
     half = np.asarray(cv2.resize(image, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA), dtype=np.uint8)
-    part = Region(region.left // 2, region.top // 2, (region.right + 1) // 2, (region.bottom + 1) // 2)
-    found = detect(half, part, max_keypoints // _COARSE_SHARE, pixel_sigma, spread=True)
+    parts = [part for region in regions for part in _halved(region).tiles(_TILE_PX)]
+    each = max(max_keypoints // _COARSE_SHARE // max(len(parts), 1), _LEAST_OF_TILE)
+    found = _joined([detect(half, part, each, pixel_sigma) for part in parts])
     # The centre of a pixel of half the size lies between four.
     return replace(found, pixels=2.0 * found.pixels + 0.5, information=0.25 * found.information)
 
 
-def detect(
-    image: ImageU8, region: Region, max_keypoints: int, pixel_sigma: float, spread: bool = False
-) -> Keypoints:
-    """The strongest SIFT keypoints of the region of a grey image, or of every part of it, in image pixels.
+def detect(image: ImageU8, region: Region, max_keypoints: int, pixel_sigma: float) -> Keypoints:
+    """The strongest SIFT keypoints of the region of a grey image, in the image's pixels.
 
     `pixel_sigma` is the standard deviation of a small one's place, pixels; large ones are placed less well.
     """
     top, left = max(region.top - _BORDER_PX, 0), max(region.left - _BORDER_PX, 0)
     crop = np.ascontiguousarray(image[top : region.bottom + _BORDER_PX, left : region.right + _BORDER_PX])
     # Without the precise upscale OpenCV's positions are shifted by a quarter of a pixel.
-    sift = cv2.SIFT.create(nfeatures=0 if spread else max_keypoints, enable_precise_upscale=True)
-    if spread:
-        found, descriptors = sift.compute(crop, _spread(sift.detect(crop, None), max_keypoints))
-    else:
-        found, descriptors = sift.detectAndCompute(crop, None)
+    sift = cv2.SIFT.create(nfeatures=max_keypoints, enable_precise_upscale=True)
+    found, descriptors = sift.detectAndCompute(crop, None)
     if not found:
         return _no_keypoints()
     pixels = np.array([keypoint.pt for keypoint in found], dtype=np.float64)
@@ -93,16 +90,21 @@ def detect(
     return Keypoints(pixels, information, descriptors[order].astype(np.float32), _places(pixels))
 
 
-def _spread(found: Sequence[cv2.KeyPoint], count: int) -> list[cv2.KeyPoint]:
-    """As many keypoints, the strongest of every cell before the second of any."""
-    strongest = sorted(found, key=lambda keypoint: -keypoint.response)
-    cell = np.array([keypoint.pt for keypoint in strongest]).reshape(-1, 2) // _SPREAD_CELL_PX
-    taken: Counter[tuple[float, ...]] = Counter()
-    rank = []
-    for key in map(tuple, cell.tolist()):
-        rank.append(taken[key])
-        taken[key] += 1
-    return [strongest[k] for k in np.argsort(rank, kind="stable")[:count]]
+def _halved(region: Region) -> Region:
+    return Region(region.left // 2, region.top // 2, (region.right + 1) // 2, (region.bottom + 1) // 2)
+
+
+def _joined(parts: Sequence[Keypoints]) -> Keypoints:
+    """The keypoints of several parts of an image, no place of which is in two."""
+    if not parts:
+        return _no_keypoints()
+    first = np.cumsum([0] + [int(part.place.max(initial=-1)) + 1 for part in parts])
+    return Keypoints(
+        np.concatenate([part.pixels for part in parts]),
+        np.concatenate([part.information for part in parts]),
+        np.concatenate([part.descriptors for part in parts]),
+        np.concatenate([part.place + start for part, start in zip(parts, first, strict=False)]),
+    )
 
 
 def _places(pixels: Array) -> npt.NDArray[np.intp]:

@@ -3,10 +3,10 @@
 Nothing here assumes which image axis is vertical: the poses say it.
 """
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
-from functools import lru_cache
-from itertools import combinations
+from functools import lru_cache, reduce
+from itertools import combinations, pairwise
 
 import numpy as np
 import numpy.typing as npt
@@ -45,6 +45,34 @@ class Region:
             max(self.right, other.right),
             max(self.bottom, other.bottom),
         )
+
+    def meets(self, other: "Region") -> bool:
+        """Whether the two share a pixel."""
+        across = self.left < other.right and other.left < self.right
+        return across and self.top < other.bottom and other.top < self.bottom
+
+    def tiles(self, side_px: int) -> list["Region"]:
+        """The region cut into equal parts, about as wide and high as said."""
+        columns, rows = (
+            np.linspace(low, high, max(round((high - low) / side_px), 1) + 1).round().astype(int).tolist()
+            for low, high in ((self.left, self.right), (self.top, self.bottom))
+        )
+        return [
+            Region(left, top, right, bottom)
+            for top, bottom in pairwise(rows)
+            for left, right in pairwise(columns)
+        ]
+
+
+def joined(regions: Iterable[Region]) -> list[Region]:
+    """Regions that are apart and hold all of the given ones."""
+    apart: list[Region] = []
+    for region in regions:
+        met = [other for other in apart if other.meets(region)]
+        whole = reduce(Region.union, met, region)
+        apart = [other for other in apart if other not in met]
+        apart = joined([*apart, whole]) if met else [*apart, whole]
+    return apart
 
 
 def whole_image(intrinsics: Intrinsics) -> Region:
