@@ -26,7 +26,7 @@ class Scene:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Tracks:
-    """`count` tracks; observation m is keypoint `row` (M,) of the camera with id `camera` (M,) on `track` (M,).
+    """`count` tracks; observation m is keypoint `row` (M,) of the camera with id `camera` (M,) on `track`.
 
     The observations of a track stand together.
     """
