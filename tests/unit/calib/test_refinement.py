@@ -133,8 +133,7 @@ def test_a_patch_whose_depth_may_be_the_walls_behind_a_thing_is_not_taken(
     """Beside a hole or a step the depth of one place says little of the texture around it."""
     torn = {c: replace(camera, disparity=camera.disparity.copy()) for c, camera in cameras.items()}
     for camera in torn.values():
-        camera.disparity[::16] = np.nan  # three rows of a patch's fifteen are the most that this takes
-        camera.disparity[1::16] = np.nan
+        camera.disparity[::6] = np.nan  # two or three of a patch's fifteen rows: a plane fits all the same
     there = refine(torn, regions, poses_off(), NO_CORRECTION, PREDICTION_PX)
     assert len(refined.matches[PAIR]) > 100
     assert len(there.matches[PAIR]) == 0
