@@ -7,6 +7,7 @@ from rig_protocol.datagram import Buffer, DatagramBatch
 from rig_protocol.fragmenter import fragment
 from rig_protocol.frame_history import FrameHistory
 from rig_protocol.frames import EncodedFrame
+from rig_protocol.gravity import Gravity
 from rig_protocol.handshake import Agreement
 from rig_protocol.message_bytes import encode_body
 from rig_protocol.messages import ClockReply, ClockRequest, Goodbye, Heartbeat, Message, Resend
@@ -77,7 +78,11 @@ class AgentSession:
         self._resends.append(resend)
 
     def datagrams_to_send(
-        self, now_ns: int, health: Mapping[str, float], system_clock: SystemClockReading | None
+        self,
+        now_ns: int,
+        health: Mapping[str, float],
+        gravity: Gravity | None,
+        system_clock: SystemClockReading | None,
     ) -> list[bytes]:
         """Clock replies, stamped with `now_ns`, and the heartbeat where it is due."""
         datagrams = [
@@ -88,7 +93,7 @@ class AgentSession:
         if is_due(self._heartbeat_due_ns, now_ns, HEARTBEAT_INTERVAL_NS):
             interval_ns = HEARTBEAT_INTERVAL_NS if self.confirmed else CONFIRM_INTERVAL_NS
             self._heartbeat_due_ns = now_ns + interval_ns
-            datagrams.append(self.seal(Heartbeat(health, self._sent_frames)))
+            datagrams.append(self.seal(Heartbeat(health, self._sent_frames, gravity)))
         return datagrams
 
     def cut(self, frame: EncodedFrame, datagram_size: int) -> DatagramBatch:
