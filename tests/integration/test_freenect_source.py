@@ -162,10 +162,11 @@ def test_a_motor_that_never_answers_costs_no_frame(usb_bus: VirtualBus) -> None:
     usb_bus.add_kinect("A00364A11111111A").write("mute_motor")
     with FreenectSource(FreenectSettings()) as source:
         frames = frames_of(source, seconds=1.5)
-        assert source.counters["unpaired"] == source.counters["damaged"] == 0
+        counters = source.counters
     assert all(frame.gravity is None for frame in frames)
-    steps = [later.timestamp_ns - earlier.timestamp_ns for earlier, later in pairwise(frames)]
-    assert max(steps) < 2.5 * FRAME_INTERVAL_NS
+    assert counters["unpaired"] == counters["damaged"] == 0
+    # Whoever waited for the motor would lose a quarter of a second, seven frames, each time.
+    assert len(frames) + counters["overrun"] > 36
 
 
 def test_a_child_process_finds_the_virtual_bus_in_place_of_the_machines(usb_bus: VirtualBus) -> None:

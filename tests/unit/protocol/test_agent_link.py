@@ -205,13 +205,15 @@ def test_a_heartbeat_tells_how_many_frames_have_left_whole(left_of_the_last: int
     assert sent(agent, server, T0 + HEARTBEAT_INTERVAL_NS) == [Heartbeat({}, told)]
 
 
-def test_heartbeats_tell_which_way_the_camera_feels_down_while_it_does() -> None:
+def test_heartbeats_tell_gravity_at_once_when_it_is_felt_and_when_it_is_not_any_more() -> None:
     agent, server = connected()
     agent.gravity = Gravity((0.0, 1.0, 0.0))
-    due_ns = T0 + HEARTBEAT_INTERVAL_NS
-    assert sent(agent, server, due_ns) == [Heartbeat({}, gravity=agent.gravity)]
+    assert sent(agent, server, T0 + 1) == [Heartbeat({}, gravity=agent.gravity)]
+    agent.gravity = Gravity((0.0, 0.0, 1.0))
+    assert sent(agent, server, T0 + 2) == []
+    assert sent(agent, server, T0 + 1 + HEARTBEAT_INTERVAL_NS) == [Heartbeat({}, gravity=agent.gravity)]
     agent.gravity = None
-    assert sent(agent, server, due_ns + HEARTBEAT_INTERVAL_NS) == [Heartbeat({})]
+    assert sent(agent, server, T0 + 2 + HEARTBEAT_INTERVAL_NS) == [Heartbeat({})]
 
 
 def test_health_against_the_limits_is_misuse() -> None:
