@@ -9,11 +9,13 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from rig_calib.bundle_adjustment import ROUGHLY_CONVERGED
 from rig_calib.edges import TOLERANCE, Edge, estimate_edge
 from rig_calib.matching import Matches
 from rig_calib.noise import NoiseModel
 from rig_calib.observed_camera import ObservedCamera
 from rig_calib.overlap import Region
+from rig_calib.parallel import in_threads
 from rig_calib.refinement import RefinedRig, refine
 from rig_calib.registration import ransac
 from rig_calib.rig_adjustment import AT_REST, AdjustedRig, adjust_rig
@@ -27,7 +29,7 @@ Pair = tuple[int, int]
 # Rough, to judge how far a prediction may be off.
 _FOCAL_PX, _NEAR_WALL_M = 525.0, 1.5
 # Patches are looked for again while poses move by more than a patch's alignment makes up for.
-_MAX_ROUNDS, _SETTLED_PX = 9, 3.0
+_MAX_ROUNDS, _SETTLED_PX = 9, 6.0
 _DEPTH_ROUNDS = 4  # of pairs that nothing but the drawing predicts
 # What is far off must not count as an outlier at once: noise goes down to what it is.
 _GRADUATED_NOISE = tuple(
@@ -66,7 +68,7 @@ def estimate_jointly(
     if len(start) < 2:
         return None
     keypoint_matches = {edge.pair: edge.agreeing_matches for edge in edges if edge.reason is None}
-    rig = adjust_rig(cameras, keypoint_matches, start, ring, settings)
+    rig = adjust_rig(cameras, keypoint_matches, start, ring, settings, converged=ROUGHLY_CONVERGED)
     far = {pair for pair, px in _prediction_px(rig, regions).items() if px > _FAR_AND_WIDE_PX}
     noise = AT_REST
     for k in range(_MAX_ROUNDS):
@@ -78,15 +80,15 @@ def estimate_jointly(
         matches = _verified(refined, far - depth_only, prediction_px, settings)
         graduated = bool(far) and k < len(_GRADUATED_NOISE)
         assumed = _GRADUATED_NOISE[k] if graduated else noise
-        rig = adjust_rig(refined.cameras, matches, before, ring, settings, assumed)
+        rig = adjust_rig(refined.cameras, matches, before, ring, settings, assumed, rig.states)
         if not graduated:
             noise = rig.observed_noise()
             if _largest_shift_px(before, rig.poses, regions) < _SETTLED_PX:
                 break
     if noise.differs_from(rig.noise):
-        rig = adjust_rig(refined.cameras, matches, rig.poses, ring, settings, noise)
-    judged = tuple(_refined_edge(edge, refined, matches, rig, settings) for edge in edges)
-    return JointEstimate(rig, refined.cameras, judged)
+        rig = adjust_rig(refined.cameras, matches, rig.poses, ring, settings, noise, rig.states)
+    judged = in_threads(lambda edge: _refined_edge(edge, refined, matches, rig, settings), edges)
+    return JointEstimate(rig, refined.cameras, tuple(judged))
 
 
 def _drawn(cameras: Mapping[int, ObservedCamera]) -> dict[int, Pose]:
@@ -143,7 +145,7 @@ def _refined_edge(
         reason = edge.reason or "nothing that both cameras recognise was left when depth was corrected"
         return replace(edge, matches=_NO_MATCHES, inlier=np.zeros(0, dtype=bool), reason=reason)
     T_i_j = inverse(rig.poses[i]) @ rig.poses[j]
-    return estimate_edge(refined.cameras[i], refined.cameras[j], rows, T_i_j, settings)
+    return estimate_edge(refined.cameras[i], refined.cameras[j], rows, T_i_j, settings, rig.states)
 
 
 def _prediction_px(rig: AdjustedRig, pairs: Iterable[Pair]) -> dict[Pair, float]:
