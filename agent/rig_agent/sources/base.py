@@ -51,7 +51,8 @@ class FrameSource(Protocol):
     def read(self, timeout_s: float) -> RgbdFrame | None:
         """The next frame, stamped in agent time (CLOCK_MONOTONIC, ns), or None after `timeout_s`.
 
-        The agent replaces `camera_id`. Raises SourceLost when the device died, DataError when what the
+        The agent replaces `camera_id`. `gravity` is what an accelerometer feels now; None where there is none
+        or the camera is being moved. Raises SourceLost when the device died, DataError when what the
         source reads is malformed.
         """
         ...
