@@ -14,7 +14,7 @@ from typing import Self, cast
 
 from pydantic import Field
 
-from rig_agent.sources.base import SourceDescription, SourceLost
+from rig_agent.sources.base import ControlRefused, ControlValue, SourceDescription, SourceLost
 from rig_agent.sources.device_clock import DeviceClock
 from rig_agent.sources.factory_model import camera_model
 from rig_agent.sources.frame_pairing import ImagePair
@@ -116,6 +116,10 @@ class FreenectSource:
         if now_s - self._last_pair_s > self._timeout_s:
             raise SourceLost(f"{self._camera} has sent no images for {self._timeout_s:g} s")
         return None
+
+    def control(self, name: str, value: ControlValue) -> str:
+        """There is nothing to set: ControlRefused."""
+        raise ControlRefused(f"the Kinect cannot set {name} to {value}")
 
     def close(self) -> None:
         """Release the Kinect; takes a few seconds at most, whatever the device does."""
