@@ -25,13 +25,15 @@ from rig_protocol.datagram import (
     parse_prefix,
 )
 from rig_protocol.errors import DataError, LinkUsageError
-from rig_protocol.events import AgentEvent, Connected, Disconnected, Rejected
+from rig_protocol.events import AgentEvent, Connected, ControlRequested, Disconnected, Rejected
 from rig_protocol.frames import EncodedFrame
 from rig_protocol.gravity import Gravity
 from rig_protocol.handshake import AgentHandshake, NotAuthentic
 from rig_protocol.message_bytes import MAX_CONTROL_SIZE, decode_body, encode_body
 from rig_protocol.messages import (
     ClockRequest,
+    Control,
+    ControlResult,
     Goodbye,
     Heartbeat,
     Hello,
@@ -56,7 +58,15 @@ DOUBT_NS = 600_000_000
 _MAX_EVENTS = 64
 
 _ANSWERS = frozenset({MessageType.WELCOME, MessageType.REJECT})
-_SEALED = frozenset({MessageType.GOODBYE, MessageType.CLOCK_REQUEST, MessageType.RESEND, MessageType.PLAN})
+_SEALED = frozenset(
+    {
+        MessageType.GOODBYE,
+        MessageType.CLOCK_REQUEST,
+        MessageType.RESEND,
+        MessageType.PLAN,
+        MessageType.CONTROL,
+    }
+)
 _FROM_SERVER = _ANSWERS | _SEALED | {MessageType.UNKNOWN_SESSION}
 _ASSIGNED = frozenset(MessageType)
 
@@ -192,6 +202,12 @@ class AgentLink:
         encode_body(Heartbeat(health))  # raises where it cannot be sent
         self._health = dict(health)
 
+    def answer_control(self, request: ControlRequested, done: bool, text: str) -> None:
+        """Tell the server what became of a control; of a session that has ended, nobody wants to know."""
+        session = self._session
+        if session is not None and session.welcome.session_id == request.session_id:
+            session.controls.answer(ControlResult(request.number, done, text))
+
     def close(self, now_ns: int) -> None:  # noqa: ARG002  # the verbs of both links take the time
         """End the session with a goodbye, to be fetched with `datagrams_to_send`; nothing follows."""
         if self._session is not None:
@@ -256,8 +272,18 @@ class AgentLink:
                 session.take_resend(message)
             case StreamPlan():
                 self.plan = message
+            case Control():
+                return self._receive_control(session, message)
             case Goodbye(text):
                 self._lose(f"the server said goodbye: {text}", now_ns)
+        return None
+
+    def _receive_control(self, session: AgentSession, control: Control) -> str | None:
+        if not session.welcome.controls:
+            return "unexpected_type"
+        if session.controls.take(control):
+            session_id = session.welcome.session_id
+            self._events.append(ControlRequested(session_id, control.number, control.name, control.value))
         return None
 
     # ---- states

@@ -11,6 +11,7 @@ from rig_protocol.gravity import Gravity
 from rig_protocol.handshake import Agreement
 from rig_protocol.message_bytes import encode_body
 from rig_protocol.messages import ClockReply, ClockRequest, Goodbye, Heartbeat, Message, Resend
+from rig_protocol.remote_control import ControlReceiver
 from rig_protocol.sealed_channel import SealedChannel
 from rig_protocol.security import FrameSeal
 from rig_protocol.system_clock import SystemClockReading
@@ -33,6 +34,7 @@ class AgentSession:
         self.confirmed = False  # a sealed message of the server has come
         self.heard_ns = now_ns
         self.history = FrameHistory()
+        self.controls = ControlReceiver()
         keys, session_id = agreement.keys, self.welcome.session_id
         self._channel = SealedChannel(
             self.welcome.cipher, keys.agent_control, keys.server_control, session_id
@@ -85,7 +87,7 @@ class AgentSession:
         gravity: Gravity | None,
         system_clock: SystemClockReading | None,
     ) -> list[bytes]:
-        """Clock replies, stamped with `now_ns`, and the heartbeat where it is due.
+        """Clock replies, stamped with `now_ns`, results of controls, and the heartbeat where it is due.
 
         It is due at once when the camera begins to feel gravity, or ceases to because it is moved.
         """
@@ -94,6 +96,7 @@ class AgentSession:
             for request, received_ns in self._clock_requests
         ]
         self._clock_requests.clear()
+        datagrams += [self.seal(result) for result in self.controls.results_to_send()]
         changed = (gravity is not None) != self._tells_gravity
         if changed or is_due(self._heartbeat_due_ns, now_ns, HEARTBEAT_INTERVAL_NS):
             self._tells_gravity = gravity is not None

@@ -68,6 +68,8 @@ class MessageType(IntEnum):
     UNKNOWN_SESSION = 8
     RESEND = 9
     PLAN = 10
+    CONTROL = 11
+    CONTROL_RESULT = 12
     FRAGMENT = 16
 
 

@@ -1,9 +1,10 @@
 """What a link tells its owner: the only things that come out of `next_event()`."""
 
 from dataclasses import dataclass
+from enum import StrEnum
 
 from rig_protocol.frames import EncodedFrame
-from rig_protocol.messages import Hello, RejectReason, Welcome
+from rig_protocol.messages import ControlValue, Hello, RejectReason, Welcome
 
 Address = tuple[str, int]
 
@@ -33,7 +34,17 @@ class Disconnected:
     text: str
 
 
-AgentEvent = Connected | Rejected | Disconnected
+@dataclass(frozen=True, slots=True)
+class ControlRequested:
+    """The server wants `name` set to `value`: do it and tell `answer_control`. Each comes once."""
+
+    session_id: int
+    number: int
+    name: str
+    value: ControlValue
+
+
+AgentEvent = Connected | Rejected | Disconnected | ControlRequested
 
 
 # ---- server side
@@ -72,4 +83,22 @@ class FrameReceived:
     frame: EncodedFrame
 
 
-ServerEvent = CameraJoined | CameraLeft | HelloRefused | FrameReceived
+class Outcome(StrEnum):
+    """What became of a control; of an unanswered one nobody knows whether it was done."""
+
+    DONE = "done"
+    REFUSED = "refused"
+    UNANSWERED = "unanswered"
+
+
+@dataclass(frozen=True, slots=True)
+class ControlAnswered:
+    """What became of the control with this ticket of `ServerLink.control`; comes once for each."""
+
+    camera_id: int
+    ticket: int
+    outcome: Outcome
+    text: str
+
+
+ServerEvent = CameraJoined | CameraLeft | HelloRefused | FrameReceived | ControlAnswered

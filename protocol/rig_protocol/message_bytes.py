@@ -21,6 +21,8 @@ from rig_protocol.message_fields import (
     cipher,
     ciphers,
     codec_ids,
+    control_value,
+    flag,
     gauges,
     integer,
     number,
@@ -32,6 +34,8 @@ from rig_protocol.message_fields import (
 from rig_protocol.messages import (
     ClockReply,
     ClockRequest,
+    Control,
+    ControlResult,
     Goodbye,
     Heartbeat,
     Hello,
@@ -52,6 +56,9 @@ MIN_HELLO_SIZE = MAX_REJECT_SIZE = 512
 HELLO_OVERHEAD = PREFIX_SIZE + PUBLIC_KEY_SIZE + TAG_SIZE
 MAX_NAME_BYTES = 64
 MAX_TEXT_BYTES = 200
+MAX_CONTROL_NAME_BYTES = 32
+MAX_CONTROL_WORD_BYTES = 64
+MAX_CONTROL_NUMBER = 2**32 - 1
 MAX_CODECS = 16
 MAX_GAUGES = 16
 MAX_GAUGE_NAME_BYTES = 32
@@ -122,11 +129,17 @@ def _write_hello(hello: Hello) -> bytes:
         "fps": hello.fps,
         "software": hello.software,
         "ciphers": [int(one) for one in hello.ciphers],
+        **_controls_key(hello.controls),
         "padding": b"",
     }
     missing = MIN_HELLO_SIZE - HELLO_OVERHEAD - len(msgpack.packb(values))
     values["padding"] = bytes(max(0, missing))
     return bytes(msgpack.packb(values))
+
+
+def _controls_key(controls: bool) -> Fields:
+    """A later key of this version: absent where the feature is off."""
+    return {"controls": True} if controls else {}
 
 
 def _check_hello(hello: Hello) -> None:
@@ -162,6 +175,7 @@ def _hello_of(values: Fields, model: CameraModel) -> Hello:
         fps=number(values, "fps", MIN_FPS, MAX_FPS),
         software=text(values, "software", MAX_NAME_BYTES),
         ciphers=ciphers(values, "ciphers"),
+        controls=flag(values, "controls"),
     )
     if not hello.color_codecs and not hello.depth_codecs:
         raise DataError("neither color_codecs nor depth_codecs offers a stream")
@@ -181,6 +195,7 @@ def _write_welcome(welcome: Welcome) -> bytes:
                 "depth_codecs": list(welcome.depth_codecs),
                 "datagram_size": welcome.datagram_size,
                 "cipher": int(welcome.cipher),
+                **_controls_key(welcome.controls),
             }
         )
     )
@@ -195,6 +210,7 @@ def _read_welcome(body: bytes) -> Welcome:
         depth_codecs=codec_ids(values, "depth_codecs", MAX_CODECS),
         datagram_size=integer(values, "datagram_size", MIN_DATAGRAM_SIZE, MAX_DATAGRAM_SIZE),
         cipher=cipher(values.get("cipher")),
+        controls=flag(values, "controls"),
     )
 
 
@@ -311,6 +327,44 @@ def _plan_of(values: Fields) -> StreamPlan:
     )
 
 
+# ---- CONTROL
+
+
+def _write_control(control: Control) -> bytes:
+    values = {name: getattr(control, name) for name in Control.__slots__}
+    try:
+        _control_of(values)
+    except DataError as error:
+        raise LinkUsageError(f"this control cannot be sent: {error}") from error
+    return bytes(msgpack.packb(values))
+
+
+def _read_control(body: bytes) -> Control:
+    return _control_of(unpack_map(body))
+
+
+def _control_of(values: Fields) -> Control:
+    return Control(
+        number=integer(values, "number", 1, MAX_CONTROL_NUMBER),
+        name=text(values, "name", MAX_CONTROL_NAME_BYTES),
+        value=control_value(values, "value", MAX_CONTROL_WORD_BYTES),
+    )
+
+
+def _write_control_result(result: ControlResult) -> bytes:
+    said = shortened(result.text, MAX_TEXT_BYTES)
+    return bytes(msgpack.packb({"number": result.number, "done": result.done, "text": said}))
+
+
+def _read_control_result(body: bytes) -> ControlResult:
+    values = unpack_map(body)
+    return ControlResult(
+        number=integer(values, "number", 1, MAX_CONTROL_NUMBER),
+        done=flag(values, "done", optional=False),
+        text=text(values, "text", MAX_TEXT_BYTES, shortest=0),
+    )
+
+
 _WRITERS: dict[type[Message], tuple[MessageType, Callable[[Any], bytes]]] = {
     Hello: (MessageType.HELLO, _write_hello),
     Welcome: (MessageType.WELCOME, _write_welcome),
@@ -322,6 +376,8 @@ _WRITERS: dict[type[Message], tuple[MessageType, Callable[[Any], bytes]]] = {
     UnknownSession: (MessageType.UNKNOWN_SESSION, lambda _: b""),
     Resend: (MessageType.RESEND, _write_resend),
     StreamPlan: (MessageType.PLAN, _write_plan),
+    Control: (MessageType.CONTROL, _write_control),
+    ControlResult: (MessageType.CONTROL_RESULT, _write_control_result),
 }
 
 _READERS: dict[MessageType, Callable[[bytes], Message]] = {
@@ -335,4 +391,6 @@ _READERS: dict[MessageType, Callable[[bytes], Message]] = {
     MessageType.UNKNOWN_SESSION: _read_unknown_session,
     MessageType.RESEND: _read_resend,
     MessageType.PLAN: _read_plan,
+    MessageType.CONTROL: _read_control,
+    MessageType.CONTROL_RESULT: _read_control_result,
 }

@@ -61,6 +61,22 @@ def text(values: Fields, key: str, longest: int, shortest: int = 1) -> str:
     return value
 
 
+def flag(values: Fields, key: str, optional: bool = True) -> bool:
+    """A boolean; an optional one is false where it is absent."""
+    value = values.get(key, False if optional else None)
+    if not isinstance(value, bool):
+        raise DataError(f"{key} must be true or false")
+    return value
+
+
+def control_value(values: Fields, key: str, longest: int) -> bool | float | str:
+    """What a control is set to: a boolean, a finite number or a word."""
+    value = values.get(key)
+    if isinstance(value, bool):
+        return value
+    return text(values, key, longest) if isinstance(value, str) else number(values, key)
+
+
 def optional(read: Callable[..., T], values: Fields, key: str, *limits: int) -> T | None:
     """What `read` yields, or None where the value is nil; an absent key is an error."""
     if key in values and values[key] is None:

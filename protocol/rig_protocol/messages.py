@@ -10,6 +10,8 @@ from rig_protocol.frames import EncodedFrame
 from rig_protocol.gravity import Gravity
 from rig_protocol.security import Cipher
 
+ControlValue = bool | float | str
+
 
 class RejectReason(Enum):
     """Why a hello was refused; the value is the wire code."""
@@ -30,7 +32,7 @@ class Hello:
 
     `camera_id` is the slot in the rig; None leaves it to the server, which knows the camera by its
     serial or port path. Codecs are wire ids in the agent's order of preference; ciphers in the order of
-    their speed on the agent's processor.
+    their speed on the agent's processor. `controls`: it does what a Control says.
     """
 
     name: str
@@ -43,6 +45,7 @@ class Hello:
     fps: float
     software: str
     ciphers: tuple[Cipher, ...] = tuple(Cipher)
+    controls: bool = False
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,7 +53,7 @@ class Welcome:
     """The server's choices for one session.
 
     Of the codecs, those of the hello that it takes, in the agent's order; none means: do not send this
-    stream. The first is the one to send until a plan says otherwise.
+    stream. The first is the one to send until a plan says otherwise. `controls`: there may be Controls.
     """
 
     session_id: int
@@ -59,6 +62,7 @@ class Welcome:
     depth_codecs: tuple[int, ...]
     datagram_size: int
     cipher: Cipher
+    controls: bool = False
 
     def allows(self, frame: EncodedFrame) -> bool:
         """True when every payload of the frame is in a codec that the server takes for its stream."""
@@ -171,6 +175,24 @@ class Resend:
 
 
 @dataclass(frozen=True, slots=True)
+class Control:
+    """The agent is to set `name` to `value`; `number` counts the controls of the session from 1."""
+
+    number: int
+    name: str
+    value: ControlValue
+
+
+@dataclass(frozen=True, slots=True)
+class ControlResult:
+    """What became of control `number`: done or refused, and in words for the operator."""
+
+    number: int
+    done: bool
+    text: str
+
+
+@dataclass(frozen=True, slots=True)
 class UnknownSession:
     """The server does not know the session that the prefix names."""
 
@@ -186,6 +208,8 @@ Message = (
     | UnknownSession
     | Resend
     | StreamPlan
+    | Control
+    | ControlResult
 )
 
 WHOLE_FRAME = ((0, 0xFFFF),)

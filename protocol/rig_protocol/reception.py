@@ -176,7 +176,14 @@ class Reception:
         objection = self._objection(camera_id, hello, address, now_ns)
         if objection is not None:
             return no_room(objection)
-        return Welcome(self._new_session_id(), camera_id, *codecs, terms.datagram_size, hello.ciphers[0])
+        return Welcome(
+            self._new_session_id(),
+            camera_id,
+            *codecs,
+            terms.datagram_size,
+            hello.ciphers[0],
+            controls=hello.controls,
+        )
 
     def _answer(
         self, nonce: int, datagram: Buffer, hello: Hello, welcome: Welcome, address: Address, now_ns: int

@@ -29,11 +29,21 @@ from rig_protocol.events import (
     Address,
     CameraJoined,
     CameraLeft,
+    ControlAnswered,
     FrameReceived,
+    Outcome,
     ServerEvent,
 )
-from rig_protocol.message_bytes import MAX_CONTROL_SIZE, decode_body
-from rig_protocol.messages import ClockReply, Goodbye, Heartbeat, StreamChoice
+from rig_protocol.message_bytes import MAX_CONTROL_SIZE, decode_body, encode_body
+from rig_protocol.messages import (
+    ClockReply,
+    Control,
+    ControlResult,
+    ControlValue,
+    Goodbye,
+    Heartbeat,
+    StreamChoice,
+)
 from rig_protocol.pending_sessions import PendingSession
 from rig_protocol.reception import Reception, Terms
 from rig_protocol.resend_budget import ResendBudget
@@ -49,7 +59,14 @@ _BACKWARD_STEP_NS = 1_000_000_000
 # Answers wait for one turn of the shell; a flood of hellos beyond this loses its oldest answers.
 _MAX_OUTGOING = 1024
 _ASSIGNED = frozenset(MessageType)
-_SEALED = frozenset({MessageType.GOODBYE, MessageType.HEARTBEAT, MessageType.CLOCK_REPLY})
+_SEALED = frozenset(
+    {
+        MessageType.GOODBYE,
+        MessageType.HEARTBEAT,
+        MessageType.CLOCK_REPLY,
+        MessageType.CONTROL_RESULT,
+    }
+)
 
 
 class ServerLink:
@@ -82,6 +99,7 @@ class ServerLink:
         self._sessions = SessionTable(self._resend_budget)
         self._clock_due: list[ServerSession] = []
         self._latest_ns = 0
+        self._tickets = 0
         self._due_ns: int | None = None  # never later than what is due; None: nobody is connected
         self._events = EventQueue()
         self._outgoing: deque[tuple[bytes, Address]] = deque(maxlen=_MAX_OUTGOING)
@@ -142,6 +160,8 @@ class ServerLink:
         for session in self._sessions:
             for request in session.handle_timeout(now_ns):
                 self._send(request, session.address)
+            for ticket in session.controls.given_up():
+                self._tell(session, ticket, Outcome.UNANSWERED, "no answer came in time")
             if session.silent(now_ns):
                 silence_s = (now_ns - session.last_heard_ns) / 1e9
                 self._end(session, f"silent for {silence_s:.1f} s")
@@ -161,6 +181,27 @@ class ServerLink:
         session = self._sessions.of_camera(camera_id)
         if session is not None:
             session.choose(choice)
+
+    def control(self, camera_id: int, name: str, value: ControlValue, now_ns: int) -> int:
+        """Have a camera's agent set something; a ticket, of which `ControlAnswered` tells what became.
+
+        LinkUsageError for a name or a value that no message can tell.
+        """
+        encode_body(Control(1, name, value))
+        self._tickets += 1
+        ticket, session = self._tickets, self._sessions.of_camera(camera_id)
+        if session is None:
+            refusal = "it is not connected"
+        elif not session.welcome.controls:
+            refusal = "its agent is of a release that takes no controls: upgrade it"
+        elif not session.controls.ask(ticket, name, value, now_ns):
+            refusal = "too many controls wait for its agent already"
+        else:
+            self._wake_at(now_ns)
+            session.due_ns = min(session.due_ns, now_ns)
+            return ticket
+        self._push(ControlAnswered(camera_id, ticket, Outcome.REFUSED, refusal))
+        return ticket
 
     def dismiss(self, camera_id: int, why: str) -> None:
         """End a camera's session with a goodbye that says why."""
@@ -248,8 +289,21 @@ class ServerLink:
             case ClockReply():
                 for frame in session.receive_clock_reply(message, self.system_clock, now_ns):
                     self._push(FrameReceived(frame))
+            case ControlResult():
+                self._receive_result(session, message, now_ns)
             case Goodbye(text):
                 self._end(session, f"goodbye: {text}")
+
+    def _receive_result(self, session: ServerSession, result: ControlResult, now_ns: int) -> None:
+        ticket = session.controls.take_result(result, now_ns)
+        if ticket is None:  # a copy, or one that comes after we gave up waiting
+            self.rejected["stale_result"] += 1
+        else:
+            self._tell(session, ticket, Outcome.DONE if result.done else Outcome.REFUSED, result.text)
+        session.due_ns = min(session.due_ns, session.controls.due_ns)
+
+    def _tell(self, session: ServerSession, ticket: int, outcome: Outcome, text: str) -> None:
+        self._push(ControlAnswered(session.welcome.camera_id, ticket, outcome, text))
 
     def _session_of(self, session_id: int, count: int, address: Address, now_ns: int) -> ServerSession | None:
         """The session of a datagram; None (counted, answered) when there is none."""
@@ -285,6 +339,8 @@ class ServerLink:
 
     def _end(self, session: ServerSession, text: str) -> None:
         self._sessions.end(session)
+        for ticket in session.controls.close():
+            self._tell(session, ticket, Outcome.UNANSWERED, f"its session ended: {text}")
         self._push(CameraLeft(session.welcome.camera_id, text))
 
     def _end_all(self, text: str) -> None:

@@ -15,6 +15,7 @@ from rig_protocol.handshake import Agreement
 from rig_protocol.message_bytes import encode_body
 from rig_protocol.messages import ClockReply, Heartbeat, Hello, Message, StreamChoice, StreamPlan
 from rig_protocol.reassembler import Reassembler
+from rig_protocol.remote_control import ControlSender
 from rig_protocol.resend_budget import ResendBudget
 from rig_protocol.sealed_channel import SealedChannel
 from rig_protocol.security import FrameSeal
@@ -81,6 +82,7 @@ class ServerSession:
             FrameSeal(welcome.cipher, keys),
             resend_budget,
         )
+        self.controls = ControlSender()
         self.due_ns = now_ns
 
     def receive_fragments(
@@ -157,7 +159,10 @@ class ServerSession:
     def _refresh_due(self) -> None:
         """When there is something to do next."""
         self.due_ns = min(
-            self._clock.next_request_ns, self.last_heard_ns + SILENCE_NS, self._reassembler.due_ns
+            self._clock.next_request_ns,
+            self.last_heard_ns + SILENCE_NS,
+            self._reassembler.due_ns,
+            self.controls.due_ns,
         )
 
     def silent(self, now_ns: int) -> bool:
@@ -165,8 +170,9 @@ class ServerSession:
         return now_ns - self.last_heard_ns >= SILENCE_NS
 
     def handle_timeout(self, now_ns: int) -> list[bytes]:
-        """Give up the frames whose time is over; requests for fragments that are missed."""
-        requests = self._reassembler.handle_timeout(now_ns)
+        """Give up the frames whose time is over; requests for missed fragments, and the control in flight."""
+        requests: list[Message] = [*self._reassembler.handle_timeout(now_ns)]
+        requests += self.controls.messages_due(now_ns)
         self._refresh_due()
         return [self.seal(request) for request in requests]
 

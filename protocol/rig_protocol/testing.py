@@ -11,7 +11,7 @@ from dataclasses import dataclass, field
 
 from rig_protocol.agent_link import AgentLink
 from rig_protocol.datagram import DatagramBatch
-from rig_protocol.events import Address, AgentEvent, ServerEvent
+from rig_protocol.events import Address, AgentEvent, ControlRequested, ServerEvent
 from rig_protocol.frames import EncodedFrame
 from rig_protocol.server_link import ServerLink
 
@@ -144,6 +144,7 @@ class VirtualAgent:
     next_frame_ns: int = 0
     sequence: int = 0
     events: list[AgentEvent] = field(default_factory=list)
+    obey: Callable[[ControlRequested], str] | None = None  # does what a control says; in words
 
     def due_times(self) -> list[int]:
         """True times at which something happens here."""
@@ -161,6 +162,8 @@ class VirtualAgent:
         self.link.handle_timeout(agent_ns)
         while (event := self.link.next_event()) is not None:
             self.events.append(event)
+            if isinstance(event, ControlRequested) and self.obey is not None:
+                self.link.answer_control(event, done=True, text=self.obey(event))
         for datagram in self.link.datagrams_to_send(agent_ns):
             self.uplink.send(datagram, now_ns)
         if self.make_frame is not None and now_ns >= self.next_frame_ns:

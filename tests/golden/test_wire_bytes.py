@@ -37,6 +37,7 @@ def test_the_handshake_is_written_as_pinned() -> None:
     welcome, keys = golden.welcome_and_keys()
     assert welcome.hex() == VECTORS["welcome"]
     assert keys == KEYS
+    assert golden.welcome_and_keys(golden.WELCOME_WITH_CONTROLS)[0].hex() == VECTORS["welcome with controls"]
 
 
 @pytest.mark.parametrize("name", golden.HELLOS)
@@ -49,6 +50,8 @@ def test_a_pinned_hello_is_read(name: str) -> None:
 def test_the_pinned_welcome_is_read() -> None:
     agreement = golden.hello_of("full").open_welcome(bytes.fromhex(VECTORS["welcome"]))
     assert (agreement.welcome, agreement.keys) == (golden.WELCOME, KEYS)
+    agreement = golden.hello_of("full").open_welcome(bytes.fromhex(VECTORS["welcome with controls"]))
+    assert agreement.welcome == golden.WELCOME_WITH_CONTROLS
 
 
 def test_messages_outside_of_a_session_are_written_and_read_as_pinned() -> None:

@@ -114,8 +114,19 @@ def test_nothing_escapes_the_agent(data: st.DataObject, connected: bool) -> None
         events_of(agent)
 
 
-FROM_AGENT = [MessageType.GOODBYE, MessageType.HEARTBEAT, MessageType.CLOCK_REPLY]
-FROM_SERVER = [MessageType.GOODBYE, MessageType.CLOCK_REQUEST, MessageType.RESEND, MessageType.PLAN]
+FROM_AGENT = [
+    MessageType.GOODBYE,
+    MessageType.HEARTBEAT,
+    MessageType.CLOCK_REPLY,
+    MessageType.CONTROL_RESULT,
+]
+FROM_SERVER = [
+    MessageType.GOODBYE,
+    MessageType.CLOCK_REQUEST,
+    MessageType.RESEND,
+    MessageType.PLAN,
+    MessageType.CONTROL,
+]
 BODIES = st.binary(max_size=300) | st.builds(msgpack.packb, ANYTHING)
 
 

@@ -1,6 +1,7 @@
 """What `wire_v2.json` pins: a handshake of given secrets, every message, and a frame under both ciphers."""
 
 from collections.abc import Callable
+from dataclasses import replace
 
 from rig_protocol.camera import CameraModel, Intrinsics
 from rig_protocol.clear_datagram import encode_clear
@@ -14,6 +15,8 @@ from rig_protocol.messages import (
     WHOLE_FRAME,
     ClockReply,
     ClockRequest,
+    Control,
+    ControlResult,
     Goodbye,
     Heartbeat,
     Hello,
@@ -46,8 +49,12 @@ HELLOS: dict[str, Hello] = {
         "cam", None, None, None, CameraModel(depth=None, T_color_depth=None), (2,), (), 15.0, "test",
         (Cipher.CHACHA20_POLY1305,),
     ),
+    "with controls": Hello(
+        "cam08", 8, None, None, _MODEL, (3,), (5,), 30.0, "rig-agent 0.1.0", controls=True
+    ),
 }  # fmt: skip
 WELCOME = Welcome(SESSION_ID, 7, (3, 2), (5,), 1472, Cipher.AES_256_GCM)
+WELCOME_WITH_CONTROLS = replace(WELCOME, controls=True)
 
 CLEAR: dict[str, tuple[Message, int]] = {
     "reject": (Reject(RejectReason.WRONG_KEY, "the agent holds another key"), NONCE),
@@ -59,6 +66,7 @@ FROM_AGENT: dict[str, Message] = {
     "clock reply of a disciplined clock": ClockReply(1, 2, 3, 1_700_000_000_000_000_000, 25_000),
     "goodbye": Goodbye("the agent stops"),
     "heartbeat with gravity": Heartbeat({}, 5, Gravity((0.6, -0.8, 0.0), 1.5)),
+    "control result": ControlResult(3, True, "the LED blinks green"),
 }
 FROM_SERVER: dict[str, Message] = {
     "clock request": ClockRequest(1_000_000_000),
@@ -66,6 +74,9 @@ FROM_SERVER: dict[str, Message] = {
     "resend of a whole frame": Resend(10, WHOLE_FRAME),
     "plan": StreamPlan(3, None, 15.0, 1_000_000, 250_000, 0.8, -123_456_789),
     "goodbye": Goodbye("the server stops"),
+    "control by a word": Control(1, "led", "green"),
+    "control by a number": Control(2, "tilt_deg", -4.5),
+    "control by a switch": Control(3, "depth", False),
 }
 
 FRAME = EncodedFrame(
@@ -92,10 +103,10 @@ def hello_of(name: str) -> AgentHandshake:
     return AgentHandshake(HELLOS[name], RIG_KEY, given(NONCE, AGENT_PRIVATE))
 
 
-def welcome_and_keys() -> tuple[bytes, SessionKeys]:
+def welcome_and_keys(welcome: Welcome = WELCOME) -> tuple[bytes, SessionKeys]:
     """The server's answer to the full hello."""
     hello = hello_of("full").datagram
-    datagram, agreement = answer_hello(hello, NONCE, WELCOME, RIG_KEY, given(0, SERVER_PRIVATE))
+    datagram, agreement = answer_hello(hello, NONCE, welcome, RIG_KEY, given(0, SERVER_PRIVATE))
     return datagram, agreement.keys
 
 
