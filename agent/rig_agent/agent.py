@@ -19,11 +19,13 @@ from rig_agent.encoder import encode_frame
 from rig_agent.frame_queue import FrameQueue
 from rig_agent.health import HealthLog, Totals, gauges
 from rig_agent.hello import make_hello
+from rig_agent.remote_control import RemoteControl
 from rig_agent.sources.base import FrameSource, SourceDescription
 from rig_agent.transport import now_ns
 from rig_agent.uplink import Uplink, Wanted
 from rig_protocol.agent_session import is_due
 from rig_protocol.errors import RigError
+from rig_protocol.events import ControlRequested
 from rig_protocol.frames import EncodedFrame, RgbdFrame
 from rig_protocol.messages import Hello
 from rig_protocol.rig_key import RigKey
@@ -52,12 +54,15 @@ class Agent:
         self._capture = Capture(
             open_source, settings.fps, self._source_opened, self._captured.put, self._fail
         )
+        self._remote = RemoteControl(self._capture, self._wake_up)
         self._encoder = threading.Thread(target=self._encode_frames, name="encoder", daemon=True)
         self._uplink = Uplink(settings, rig_key, SystemClock(now_ns, time.time_ns).read)
         self._hello: Hello | None = None  # of the source that is open now
         self._introduced: Hello | None = None
         self._wanted: Wanted | None = None  # what the encoder encodes for; None: nobody listens
         self._unheard = 0
+        self.restarts = False
+        """True when `run` ended for the program to start anew."""
         self._failure: Exception | None = None
         self._stopping = threading.Event()
         self._wake = os.eventfd(0, os.EFD_NONBLOCK | os.EFD_CLOEXEC)
@@ -115,6 +120,9 @@ class Agent:
                 self._uplink.report_health(gauges(self.totals))
             if is_due(health.due_ns, time_ns, health.interval_ns):
                 _log.info("%s", health.line(self.totals, self._wanted is not None, time_ns))
+            if self._remote.restart_due(time_ns):
+                self.restarts = True
+                return
             if hang.lasts(self._capture.last_sign_ns, time_ns):
                 raise RigError(f"the {self._settings.source} driver hangs: start the agent anew")
 
@@ -133,8 +141,15 @@ class Agent:
             self._introduced = hello
             self._uplink.introduce(hello, time_ns)
         self._uplink.report_gravity(self._capture.gravity)
+        while (answer := self._remote.next_answer()) is not None:
+            self._uplink.answer_control(*answer)
         # Control first: cutting a frame takes a millisecond, which the clock exchange would feel.
         self._uplink.serve(time_ns)
+        while (news := self._uplink.next_news()) is not None:
+            if isinstance(news, ControlRequested):
+                self._remote.take(news, time_ns)
+            else:
+                self._remote.session_ended()
         self._wanted = self._uplink.wanted
         if self._wanted is not None:
             self._capture.want(self._wanted.fps, self._wanted.rig_offset_ns)

@@ -2,12 +2,13 @@
 
 import logging
 import threading
-from collections import Counter
+from collections import Counter, deque
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 
-from rig_agent.sources.base import FrameSource, SourceDescription, SourceLost
+from rig_agent.sources.base import ControlRefused, ControlValue, FrameSource, SourceDescription, SourceLost
 from rig_agent.transport import now_ns
+from rig_protocol.errors import RigError
 from rig_protocol.frames import RgbdFrame
 from rig_protocol.gravity import Gravity
 
@@ -16,6 +17,12 @@ _log = logging.getLogger(__name__)
 _READ_TIMEOUT_S = 0.5
 _FIRST_RETRY_S = 0.5
 _LAST_RETRY_S = 2.0  # a Kinect plugged in again must be back within 5 s
+_MAX_CONTROLS = 32  # the server has one under way; more are of sessions that have ended
+
+REOPEN = "reopen_source"
+"""The control that closes any source and opens it again."""
+Told = Callable[[bool, str], None]
+"""What became of a control: done or refused, and in words."""
 
 
 @dataclass(slots=True)
@@ -47,6 +54,7 @@ class Capture:
         self._max_fps = max_fps
         self._wanted: tuple[float | None, int] = None, 0
         self._on_open, self._on_frame, self._on_failure = on_open, on_frame, on_failure
+        self._controls: deque[tuple[str, ControlValue, Told]] = deque(maxlen=_MAX_CONTROLS)
         self._stopping = threading.Event()
         # A daemon: a driver that hangs must not keep the program from ending.
         self._thread = threading.Thread(target=self._run, name="capture", daemon=True)
@@ -65,6 +73,10 @@ class Capture:
     def want(self, max_fps: float | None, rig_offset_ns: int) -> None:
         """What the server wants, from any thread; rig time is agent time and `rig_offset_ns`."""
         self._wanted = max_fps, rig_offset_ns
+
+    def control(self, name: str, value: ControlValue, told: Told) -> None:
+        """Set something of the source, before it is read again; any thread may ask, capture's `told`."""
+        self._controls.append((name, value, told))
 
     def stop(self, timeout_s: float) -> bool:
         """Close the source; False when the driver did not come back in time."""
@@ -86,6 +98,7 @@ class Capture:
                 if str(error) != told:
                     _log.warning("%s; trying again until it is back", error)
                 told = str(error)
+                self._refuse_controls(f"there is no camera: {error}")
                 self._stopping.wait(retry_s)
                 retry_s = min(2 * retry_s, _LAST_RETRY_S)
             except Exception as error:  # the thread's boundary: whatever it is, the owner must hear of it
@@ -101,6 +114,8 @@ class Capture:
             offset: int | None = None
             counted_before = Counter(self.source_counters)
             while not self._stopping.is_set():
+                if not self._obey(source):
+                    return
                 frame = source.read(_READ_TIMEOUT_S)
                 self.last_sign_ns = now_ns()
                 self.source_counters = counted_before + Counter(source.counters)
@@ -114,6 +129,28 @@ class Capture:
                     self._deliver(replace(frame, sequence=frame.sequence + offset))
                 else:  # left out on purpose: no gap in the count, which tells of frames that were lost
                     offset -= 1
+
+    def _obey(self, source: FrameSource) -> bool:
+        """Do what was asked for meanwhile; False when the source is to be opened again."""
+        while self._controls:
+            name, value, told = self._controls.popleft()
+            if name == REOPEN:
+                told(True, "the source is closed and opened again")
+                return False
+            try:
+                told(True, source.control(name, value))
+            except SourceLost as error:
+                told(False, str(error))
+                raise
+            except ControlRefused as error:
+                told(False, f"{error}; of every agent: log_level, {REOPEN}, restart_agent")
+            except RigError as error:
+                told(False, str(error))
+        return True
+
+    def _refuse_controls(self, why: str) -> None:
+        while self._controls:
+            self._controls.popleft()[2](False, why)
 
     def _is_wanted(self, thinning: "_Thinning", timestamp_ns: int, source_fps: float) -> bool:
         wanted_fps, rig_offset_ns = self._wanted

@@ -1,6 +1,8 @@
 """The program `rig-agent`: streams one camera to the rig server."""
 
+import os
 import signal
+import sys
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -143,6 +145,8 @@ def _stream(settings: "AgentSettings") -> None:
 
     _on_signals(stop)
     agent.run()
+    if agent.restarts:  # the same process to systemd, or whoever watches over it
+        os.execv(sys.executable, [sys.executable, *sys.orig_argv[1:]])  # noqa: S606  # our own command line
 
 
 def _on_signals(action: Any) -> None:

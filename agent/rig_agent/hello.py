@@ -32,6 +32,7 @@ def make_hello(settings: AgentSettings, source: SourceDescription) -> Hello:
         fps=min(source.fps, settings.fps or source.fps),
         software=f"kinect-rig {version('kinect-rig')}",
         ciphers=ciphers_by_speed(),
+        controls=True,
     )
 
 

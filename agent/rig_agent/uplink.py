@@ -2,6 +2,7 @@
 
 import logging
 import secrets
+from collections import deque
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
@@ -11,7 +12,7 @@ from rig_agent.transport import Transport
 from rig_protocol.agent_link import AgentLink
 from rig_protocol.agent_session import is_due
 from rig_protocol.datagram import DatagramBatch
-from rig_protocol.events import AgentEvent, Connected, Disconnected, Rejected
+from rig_protocol.events import AgentEvent, Connected, ControlRequested, Disconnected, Rejected
 from rig_protocol.frames import EncodedFrame
 from rig_protocol.gravity import Gravity
 from rig_protocol.messages import Hello, StreamPlan, Welcome
@@ -26,6 +27,7 @@ _NO_NETWORK_RETRY_NS = 1_000_000_000
 _ONE_FRAME_NS = 33_333_333
 # Within a burst the kernel may send so much quicker than on average: bursts end well before the next one.
 _BURST_HASTE = 4.0
+_MAX_NEWS = 64  # events of one turn; the link itself keeps no more
 
 
 @dataclass(frozen=True, slots=True)
@@ -65,6 +67,7 @@ class Uplink:
         self._refusal = ""
         self._rate = 1.0  # bytes a second that the kernel may send
         self._resent_before = 0  # by the links of cameras that were introduced before
+        self._news: deque[ControlRequested | Disconnected] = deque(maxlen=_MAX_NEWS)
         self.connections = 0
         self.unheard = 0
 
@@ -120,6 +123,15 @@ class Uplink:
         """Down as the camera feels it now; the next heartbeats tell the server."""
         if self._link is not None:
             self._link.gravity = gravity
+
+    def next_news(self) -> ControlRequested | Disconnected | None:
+        """The oldest control, or end of a session, that was not fetched yet."""
+        return self._news.popleft() if self._news else None
+
+    def answer_control(self, request: ControlRequested, done: bool, text: str) -> None:
+        """Tell the server what became of a control."""
+        if self._link is not None:
+            self._link.answer_control(request, done, text)
 
     def fileno(self) -> int | None:
         """For a selector; changes when the transport opens anew."""
@@ -226,7 +238,10 @@ class Uplink:
                 self._refusal = text
             case Disconnected(text):
                 self._pacer.clear()
+                self._news.append(event)
                 _log.warning("lost %s: %s; trying on", self._server, text)
+            case ControlRequested():
+                self._news.append(event)
 
 
 def _grid(plan: StreamPlan) -> BurstGrid:

@@ -11,6 +11,7 @@ from rich.console import Console
 
 from rig_protocol.errors import ConfigurationError
 from rig_protocol.programs import EXIT_FAILED, run_program, set_up_logging
+from rig_server.operator_cli import add_operator_commands
 
 if TYPE_CHECKING:
     from rig_server.config import RigSettings
@@ -36,6 +37,8 @@ _EXAMPLES = """
 `rig-server --calibrate --coach --target-mm 3` — the same, until it is that good: hang patterns meanwhile
 
 `rig-server --calibrate --recalibrate cam04` — one camera was knocked: find it, keep all others
+
+`rig-server control cam03 depth off` — have one camera of the running rig do something (`--list`: what)
 
 `rig-server budget` — what the network must carry, what fits, and what the server would choose
 
@@ -276,10 +279,16 @@ def budget(
 def _open_rig(settings: "RigSettings", simulate: int | None, seed: int | None) -> Iterator["Rig"]:
     """The rig that the options ask for, not begun yet, and its metrics where settings ask for them."""
     from rig_server.metrics_endpoint import metrics_served
+    from rig_server.operator_requests import OperatorRequests
+    from rig_server.operator_socket import operator_served
     from rig_server.rig import Rig
 
     rig = Rig.live(settings) if simulate is None else Rig.simulated(simulate, seed or 0, settings=settings)
-    with contextlib.closing(rig), metrics_served(settings.metrics_address, rig.status):
+    with (
+        contextlib.closing(rig),
+        metrics_served(settings.metrics_address, rig.status),
+        operator_served(settings.control_socket, OperatorRequests(rig)),
+    ):
         yield rig
 
 
@@ -294,6 +303,9 @@ def _refuse_options_without_effect(
         raise ConfigurationError("--seed needs --simulate N")
     if listen is not None and simulate is not None:
         raise ConfigurationError("--listen has no effect with --simulate, which uses a free loopback port")
+
+
+add_operator_commands(app)
 
 
 def main() -> None:

@@ -140,6 +140,9 @@ class RigSettings(Settings):
     """Whether the decoder threads make the colour image of every Bayer frame, too; else who needs it does."""
     metrics: str | None = Field(None, examples=["9100"])
     """Where Prometheus may ask for metrics, [HOST:]PORT; a port alone is for this machine only."""
+    control_socket: Path | None = Field(None, examples=[Path("/run/kinect-rig/control.sock")])
+    """Where `rig-server control` reaches the running server (docs/control.md); unset: this one where the
+    server may write there, else kinect-rig/control.sock in $XDG_RUNTIME_DIR."""
     log_level: Literal["DEBUG", "INFO", "WARNING", "ERROR"] = "INFO"
     """What is worth a line in the log."""
     synchroniser: SynchroniserSettings = SynchroniserSettings()

@@ -5,6 +5,7 @@ import secrets
 import threading
 import time
 from collections import deque
+from collections.abc import Mapping
 
 from rig_protocol.codecs import COLOR_CODECS, DEPTH_CODECS
 from rig_protocol.errors import RigError
@@ -12,12 +13,13 @@ from rig_protocol.events import (
     Address,
     CameraJoined,
     CameraLeft,
+    ControlAnswered,
     FrameReceived,
     HelloRefused,
     ServerEvent,
 )
 from rig_protocol.frames import PanoramicFrame, RgbdFrame
-from rig_protocol.messages import Hello
+from rig_protocol.messages import ControlValue, Hello
 from rig_protocol.rig_folder import RigDescription
 from rig_protocol.rig_key import RigKey
 from rig_protocol.roster import Roster, Slot
@@ -32,6 +34,7 @@ from rig_server.durations import Durations
 from rig_server.link_budget import Port
 from rig_server.metrics import RigStatus
 from rig_server.receiver import Receiver, rig_time_ns
+from rig_server.remote_control import RemoteControl
 from rig_server.rig_status import StatusReader
 from rig_server.stream_control import StreamControl
 from rig_server.stream_planner import StreamPlanner
@@ -74,6 +77,7 @@ class LivePipeline:
             settings.receive_buffer_bytes,
             on_turn=self._on_turn,
         )
+        self._remote = RemoteControl(self._link, self._receiver.post)
         # After the port is ours: its first construction on a machine compiles for seconds.
         self._decoder = FrameDecoder(
             self._on_frame, threads=settings.decoder_threads, demosaic=settings.demosaic
@@ -143,6 +147,12 @@ class LivePipeline:
         """The rig at this moment; any thread may ask."""
         return self._status.read(self.hellos)
 
+    def control(self, camera: int | None, name: str, value: ControlValue) -> Mapping[int, ControlAnswered]:
+        """Have one agent, or every connected one, do something; the answers by camera id."""
+        with self._presence:
+            connected = set(self._connected)
+        return self._remote.control(connected if camera is None else {camera}, name, value)
+
     def _check_receiver(self) -> None:
         if self._receiver.failure is not None:
             raise RigError(f"receiving stopped: {self._receiver.failure!r}") from self._receiver.failure
@@ -170,6 +180,8 @@ class LivePipeline:
                 with self._presence:
                     self._connected.discard(camera_id)
                 logger.warning("camera %d left: %s", camera_id, text)
+            case ControlAnswered():
+                self._remote.take(event)
             case HelloRefused(address, _, text):
                 with self._presence:
                     # An agent tries on every few seconds; the operator is told once.

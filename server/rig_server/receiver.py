@@ -4,12 +4,14 @@ Linux hands over several datagrams of one sender in one call (UDP_GRO). Where it
 one datagram, and what waits of one sender is gathered here: the link gets batches either way.
 """
 
+import contextlib
 import logging
 import select
 import socket
 import struct
 import threading
 import time
+from collections import deque
 from collections.abc import Callable, Iterable
 from typing import Protocol
 
@@ -97,6 +99,8 @@ class Receiver:
         self._buffer = bytearray(_MAX_RECEIVE)
         self._gatherer = Gatherer()
         self._wake_receiver, self._waker = socket.socketpair()
+        self._wake_receiver.setblocking(False)
+        self._posted: deque[Callable[[int], None]] = deque()
         self._stopping = threading.Event()
         self._thread = threading.Thread(target=self._run, name="receiver", daemon=True)
 
@@ -114,6 +118,12 @@ class Receiver:
     def start(self) -> None:
         """Start receiving."""
         self._thread.start()
+
+    def post(self, work: Callable[[int], None]) -> None:
+        """Have something done soon on the receiver's thread, alone with the link; it gets the rig time."""
+        self._posted.append(work)
+        with contextlib.suppress(OSError):  # already stopped: it will not be done
+            self._waker.send(b"\0")
 
     def stop(self) -> None:
         """Say goodbye to the cameras and close the socket; harmless when already stopped."""
@@ -185,7 +195,14 @@ class Receiver:
             self._link.receive_batch(batch, sender, rig_time_ns())
             self._deliver_events()
 
+    def _do_posted(self) -> None:
+        with contextlib.suppress(BlockingIOError):
+            self._wake_receiver.recv(_MAX_RECEIVE)
+        while self._posted:
+            self._posted.popleft()(rig_time_ns())
+
     def _serve_link(self) -> None:
+        self._do_posted()
         due_ns, now_ns = self._link.next_timeout_ns(), rig_time_ns()
         if due_ns is not None and due_ns <= now_ns:
             self._link.handle_timeout(now_ns)

@@ -4,9 +4,10 @@ from collections import deque
 from collections.abc import Mapping
 from pathlib import Path
 
-from rig_protocol.errors import ConfigurationError
+from rig_protocol.errors import ConfigurationError, RigError
+from rig_protocol.events import ControlAnswered
 from rig_protocol.frames import PanoramicFrame
-from rig_protocol.messages import Hello
+from rig_protocol.messages import ControlValue, Hello
 from rig_protocol.rig_folder import RigDescription, frame_indices, read_frame, read_rig_description
 from rig_server.metrics import CameraMetrics, RigStatus
 
@@ -67,6 +68,10 @@ class RecordedRig:
         self._complete += panorama.complete
         self._partial += not panorama.complete
         return panorama
+
+    def control(self, camera: int | None, name: str, value: ControlValue) -> Mapping[int, ControlAnswered]:  # noqa: ARG002  # of no use here
+        """A recording cannot be told anything: RigError."""
+        raise RigError(f"{self.place} is a recording: nobody is there to set {name}")
 
     def status(self) -> RigStatus:
         """Cameras and sets read so far; a recording has no rates."""

@@ -11,9 +11,10 @@ from typing import Protocol, Self
 
 from rig_calib.rig_calibration import RigCalibration
 from rig_protocol.errors import ConfigurationError, DataError, RigError
+from rig_protocol.events import ControlAnswered
 from rig_protocol.frames import PanoramicFrame
 from rig_protocol.key_file import rig_key
-from rig_protocol.messages import Hello
+from rig_protocol.messages import ControlValue, Hello
 from rig_protocol.poses import Pose
 from rig_protocol.rig_folder import RigDescription
 from rig_protocol.rig_key import RigKey
@@ -70,6 +71,10 @@ class Feed(Protocol):
 
     def next_panorama(self, timeout_s: float) -> PanoramicFrame | None:
         """The next set, or None when none came in time; RigError when the feed broke."""
+        ...
+
+    def control(self, camera: int | None, name: str, value: ControlValue) -> Mapping[int, ControlAnswered]:
+        """Have one agent, or every connected one, do something; the answers by camera id."""
         ...
 
     def status(self) -> RigStatus:
@@ -186,6 +191,14 @@ class Rig:
             if on_wait is not None:
                 on_wait(self.status())
             time.sleep(_POLL_S)
+
+    def control(self, camera: int | None, name: str, value: ControlValue) -> Mapping[int, ControlAnswered]:
+        """Have one camera (None: every connected one) do something, and wait; answers by camera id.
+
+        Names and values are those of docs/control.md. Any thread may ask. ConfigurationError for what cannot
+        be told at all; what an agent refuses is an outcome, no error. RigError for a recording.
+        """
+        return self._feed.control(camera, name, value)
 
     @property
     def description(self) -> RigDescription:

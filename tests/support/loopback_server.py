@@ -5,13 +5,15 @@ import select
 import socket
 import threading
 import time
+from collections import deque
 from collections.abc import Callable
 from types import TracebackType
 from typing import Self, TypeVar
 
 from rig_protocol.codecs import COLOR_CODECS, DEPTH_CODECS
-from rig_protocol.events import Address, FrameReceived, ServerEvent
+from rig_protocol.events import Address, ControlAnswered, FrameReceived, ServerEvent
 from rig_protocol.frames import EncodedFrame
+from rig_protocol.messages import ControlValue
 from rig_protocol.rig_key import RigKey
 from rig_protocol.roster import Roster
 from rig_protocol.server_link import ServerLink
@@ -40,6 +42,7 @@ class LoopbackServer:
             roster or Roster(open=True), rig_key, secrets.token_bytes, COLOR_CODECS, DEPTH_CODECS
         )
         self.events: list[ServerEvent] = []
+        self._asked: deque[tuple[int, str, ControlValue]] = deque()
         self._changed = threading.Condition()
         self._stopping = threading.Event()
         self._silently = False
@@ -66,6 +69,12 @@ class LoopbackServer:
             assert self._changed.wait_for(lambda: bool(found()), _PATIENCE_S), f"only {self._summary()}"
             return found()
 
+    def control(self, camera_id: int, name: str, value: ControlValue) -> ControlAnswered:
+        """Have an agent do something; its answer, awaited. One at a time."""
+        answered = len([event for event in self.events if isinstance(event, ControlAnswered)])
+        self._asked.append((camera_id, name, value))
+        return self.wait_for(ControlAnswered, answered + 1)
+
     def stop(self, *, silently: bool = False) -> None:
         """End the server; harmless when ended."""
         self._silently = silently
@@ -87,6 +96,8 @@ class LoopbackServer:
         while not self._stopping.is_set():
             select.select([self._socket], [], [], 0.01)
             self._receive()
+            while self._asked:
+                self._link.control(*self._asked.popleft(), time.monotonic_ns())
             self._link.handle_timeout(time.monotonic_ns())
             self._send()
         if not self._silently:

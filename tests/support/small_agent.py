@@ -13,9 +13,9 @@ import numpy as np
 from rig_protocol.agent_link import AgentLink
 from rig_protocol.camera import CameraModel
 from rig_protocol.codecs import codec_by_name
-from rig_protocol.events import Address
+from rig_protocol.events import Address, ControlRequested
 from rig_protocol.frames import EncodedFrame, Payload
-from rig_protocol.messages import Hello
+from rig_protocol.messages import ControlValue, Hello
 from rig_protocol.rig_key import RigKey
 
 FPS = 50.0
@@ -26,7 +26,10 @@ RAW = np.arange(24, dtype=np.uint16).reshape(4, 6)
 
 
 class SmallAgent:
-    """Streams tiny frames at 50 Hz from a thread until the block ends; `silent` keeps frames back."""
+    """Streams tiny frames at 50 Hz from a thread until the block ends; `silent` keeps frames back.
+
+    It does every control but `sing`, and lists them in `done`; after `depth` off its frames have none.
+    """
 
     def __init__(self, camera_id: int, server: Address, silent: bool = False) -> None:
         hello = Hello(
@@ -39,7 +42,12 @@ class SmallAgent:
             depth_codecs=(DEPTH.id,),
             fps=FPS,
             software="test",
+            controls=True,
         )
+        self.done: list[tuple[str, ControlValue]] = []
+        self._depth_on = True
+        self.deaf = False
+        self.ignored = 0  # controls, while deaf
         self.camera_id, self.silent = camera_id, silent
         self._link = AgentLink(hello, RigKey.INSECURE, secrets.token_bytes)
         self._link.report_health({"temperature_c": 50.0 + camera_id})
@@ -79,7 +87,7 @@ class SmallAgent:
             sequence=sequence,
             timestamp_ns=timestamp_ns,
             color=Payload(COLOR.id, COLOR.encode(BAYER)),
-            depth=Payload(DEPTH.id, DEPTH.encode(RAW + self.camera_id)),
+            depth=Payload(DEPTH.id, DEPTH.encode(RAW + self.camera_id)) if self._depth_on else None,
         )
         batch = None if self.silent else self._link.send_frame(frame, time.monotonic_ns())
         for datagram in batch or ():
@@ -89,5 +97,24 @@ class SmallAgent:
         with contextlib.suppress(TimeoutError, ConnectionRefusedError):
             self._link.receive_datagram(self._socket.recv(2048), time.monotonic_ns())
         self._link.handle_timeout(time.monotonic_ns())
+        while (event := self._link.next_event()) is not None:
+            if isinstance(event, ControlRequested):
+                self._obey(event)
         for datagram in self._link.datagrams_to_send(time.monotonic_ns()):
             self._socket.send(datagram)
+
+    def leave(self) -> None:
+        """Stop streaming before the block ends."""
+        self._stop.set()
+
+    def _obey(self, request: ControlRequested) -> None:
+        if self.deaf:
+            self.ignored += 1
+            return
+        if request.name == "sing":
+            self._link.answer_control(request, done=False, text="it has depth")
+            return
+        self.done.append((request.name, request.value))
+        if request.name == "depth":
+            self._depth_on = bool(request.value)
+        self._link.answer_control(request, done=True, text=f"{request.name} is {request.value}")

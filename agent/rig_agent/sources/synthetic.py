@@ -34,10 +34,9 @@ class SyntheticSource:
         self._clock, self._sleep = clock, sleep
         self._counters = {"skipped": 0}
         self._has_depth = self._kinect.frame(0).raw is not None
-        interval_ns, phase_ns = self._kinect.frame_interval_ns, self._kinect.phase_ns
-        self._start_ns = phase_ns + ((clock() - phase_ns) // interval_ns + 1) * interval_ns
-        self._interval_ns = interval_ns
-        self._next = 0
+        self._depth_on, self._led = True, "green"
+        self._interval_ns, self._next = self._kinect.frame_interval_ns, 0
+        self._start_ns = self._first_frame_ns()
 
     @property
     def counters(self) -> Mapping[str, int]:
@@ -71,11 +70,29 @@ class SyntheticSource:
         if wait_s > 0:
             self._sleep(wait_s)
         number, self._next = self._next, self._next + 1
-        return replace(self._kinect.frame(number), timestamp_ns=taken_ns)
+        frame = replace(self._kinect.frame(number), timestamp_ns=taken_ns)
+        return frame if self._depth_on else replace(frame, raw=None)
 
     def control(self, name: str, value: ControlValue) -> str:
-        """There is nothing to set: ControlRefused."""
-        raise ControlRefused(f"the simulator cannot set {name} to {value}")
+        """`led` (remembered, nobody sees it), `depth` and `restart`."""
+        match name, value:
+            case "led", str():
+                before, self._led = self._led, value
+                return f"the LED is {value} (was {before})"
+            case "depth", bool():
+                self._depth_on = value
+                return "depth and its projector are " + ("on" if value else "off")
+            case "restart", bool():
+                self._start_ns, self._next = self._first_frame_ns(), 0
+                return "the streams start anew"
+        raise ControlRefused(
+            f"the simulator cannot set {name} to {value!r}; it has led (a word), depth (on, off) and restart"
+        )
+
+    def _first_frame_ns(self) -> int:
+        """When frame 0 is taken if streaming starts now."""
+        interval_ns, phase_ns = self._interval_ns, self._kinect.phase_ns
+        return phase_ns + ((self._clock() - phase_ns) // interval_ns + 1) * interval_ns
 
     def close(self) -> None:
         """Nothing to release."""

@@ -18,11 +18,17 @@ import pytest
 
 from rig_agent.agent import Agent, _Hang
 from rig_agent.config import AgentSettings, PacingSettings
-from rig_agent.sources.base import FrameSource, SourceDescription, SourceLost
+from rig_agent.sources.base import (
+    ControlRefused,
+    ControlValue,
+    FrameSource,
+    SourceDescription,
+    SourceLost,
+)
 from rig_protocol.camera import CameraModel, Intrinsics
 from rig_protocol.codecs import codec
 from rig_protocol.errors import DataError
-from rig_protocol.events import CameraJoined, CameraLeft, FrameReceived
+from rig_protocol.events import CameraJoined, CameraLeft, FrameReceived, Outcome
 from rig_protocol.frames import RgbdFrame
 from rig_protocol.rig_folder import CameraEntry, RigDescription, write_rig_folder
 from rig_protocol.rig_key import RigKey
@@ -42,6 +48,7 @@ class FakeSource:
         self._number = 0
         self.counters: Mapping[str, int] = {}
         self.closed = False
+        self.done: list[tuple[str, ControlValue]] = []
 
     def describe(self) -> SourceDescription:
         return SourceDescription(self._serial, None, CameraModel(), FPS, "bayer", "raw")
@@ -51,6 +58,14 @@ class FakeSource:
         time.sleep(min(1 / self._fps, timeout_s))
         number, self._number = self._number, self._number + 1
         return make_frame(number)
+
+    def control(self, name: str, value: ControlValue) -> str:
+        if name == "die":
+            raise SourceLost("the device died of it")
+        if name == "sing":
+            raise ControlRefused("there is no control sing: it has tilt_deg")
+        self.done.append((name, value))
+        return f"{name} is {value}"
 
     def close(self) -> None:
         self.closed = True
@@ -266,3 +281,111 @@ def test_neither_a_clock_that_jumps_an_hour_nor_a_stopped_program_is_a_hang(jump
     hang = _Hang()
     assert not hang.lasts(1, 10**13)
     assert not hang.lasts(1, 10**13 + jump_ns)
+
+
+def test_a_control_of_the_camera_is_done_by_it_and_answered() -> None:
+    source = FakeSource()
+    with LoopbackServer() as server, running(make_settings(server), lambda: source):
+        server.wait_for(FrameReceived)
+        answer = server.control(5, "tilt_deg", 4.0)
+        assert (answer.outcome, answer.text) == (Outcome.DONE, "tilt_deg is 4.0")
+        refused = server.control(5, "sing", "louder")
+    assert refused.outcome is Outcome.REFUSED
+    assert "it has tilt_deg" in refused.text
+    assert "log_level" in refused.text
+    assert source.done == [("tilt_deg", 4.0)]
+
+
+def test_a_control_that_the_device_dies_of_is_refused_and_the_source_opened_again() -> None:
+    opened: list[FakeSource] = []
+
+    def open_source() -> FakeSource:
+        opened.append(FakeSource())
+        return opened[-1]
+
+    with LoopbackServer() as server, running(make_settings(server), open_source):
+        server.wait_for(FrameReceived)
+        answer = server.control(5, "die", True)
+        assert (answer.outcome, answer.text) == (Outcome.REFUSED, "the device died of it")
+        seen = len(server.frames())
+        server.wait_for(FrameReceived, seen + 5)
+    assert len(opened) == 2
+
+
+def test_the_source_is_opened_again_where_the_operator_wants_it_whatever_source_it_is() -> None:
+    opened: list[FakeSource] = []
+
+    def open_source() -> FakeSource:
+        opened.append(FakeSource())
+        return opened[-1]
+
+    with LoopbackServer() as server, running(make_settings(server), open_source) as agent:
+        server.wait_for(FrameReceived)
+        assert server.control(5, "reopen_source", True).outcome is Outcome.DONE
+        server.wait_until(lambda: opened[1:])
+        assert opened[0].closed
+        assert agent.totals.source_losses == 0
+
+
+def test_the_log_level_is_set_and_a_word_that_is_none_refused() -> None:
+    root = logging.getLogger()
+    before = root.level
+    try:
+        with LoopbackServer() as server, running(make_settings(server), FakeSource):
+            server.wait_for(FrameReceived)
+            assert server.control(5, "log_level", "debug").outcome is Outcome.DONE
+            assert root.level == logging.DEBUG
+            assert server.control(5, "log_level", "loud").outcome is Outcome.REFUSED
+    finally:
+        root.setLevel(before)
+
+
+def test_depth_that_a_server_switched_off_comes_on_again_when_that_server_has_gone() -> None:
+    source = FakeSource()
+    with LoopbackServer() as server, running(make_settings(server), lambda: source):
+        server.wait_for(FrameReceived)
+        server.control(5, "depth", False)
+        server.control(5, "led", "off")  # not a stream: stays
+        server.stop()
+        await_true(lambda: ("depth", True) in source.done)
+    assert source.done == [("depth", False), ("led", "off"), ("depth", True)]
+
+
+def test_an_agent_that_is_told_to_restart_answers_first_and_ends_for_it() -> None:
+    with LoopbackServer() as server:
+        agent = Agent(make_settings(server), RigKey.INSECURE, FakeSource)
+        thread = threading.Thread(target=agent.run)
+        thread.start()
+        server.wait_for(FrameReceived)
+        assert server.control(5, "restart_agent", True).outcome is Outcome.DONE
+        thread.join(20.0)
+        assert not thread.is_alive()
+        assert agent.restarts
+        server.wait_for(CameraLeft)
+
+
+def test_the_program_that_is_told_to_restart_starts_anew_in_the_same_process(tmp_path: Path) -> None:
+    with LoopbackServer() as server:
+        host, port = server.address
+        words = [
+            "--insecure",
+            "--source",
+            "synthetic",
+            "--camera",
+            "0",
+            "--server",
+            f"{host}:{port}",
+            "--fps",
+            "5",
+        ]
+        config = tmp_path / "agent.toml"
+        config.touch()
+        command = [sys.executable, "-m", "rig_agent.cli", "--config", str(config), *words]
+        with subprocess.Popen(command, stderr=subprocess.DEVNULL) as program:
+            try:
+                server.wait_for(CameraJoined)
+                server.control(0, "restart_agent", True)
+                server.wait_for(CameraJoined, 2)
+                assert program.poll() is None
+            finally:
+                program.terminate()

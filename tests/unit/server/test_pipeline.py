@@ -2,12 +2,13 @@
 
 import time
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import pytest
 
-from rig_protocol.errors import RigError
-from rig_protocol.events import Address
+from rig_protocol.errors import ConfigurationError, RigError
+from rig_protocol.events import Address, Outcome
 from rig_protocol.frames import PanoramicFrame
 from rig_server import Rig
 from rig_server.config import CameraSettings, RigSettings, SynchroniserSettings
@@ -171,3 +172,33 @@ def test_an_occupied_port_is_refused_with_what_to_do(rig: Rig) -> None:
     host, port = address_of(rig)
     with pytest.raises(RigError, match=f"UDP port {port} is in use"):
         Rig.open(f"udp://{host}:{port}", LOOPBACK)
+
+
+def test_every_camera_does_what_it_is_told_and_the_answers_name_those_that_did_not(rig: Rig) -> None:
+    server = address_of(rig)
+    with SmallAgent(0, server) as first, SmallAgent(1, server) as second, SmallAgent(2, server):
+        rig.wait_for_cameras(10)
+        answers = rig.control(None, "tilt_deg", 5)
+        assert {i: one.outcome for i, one in answers.items()} == dict.fromkeys(range(3), Outcome.DONE)
+        [refused] = rig.control(1, "sing", "louder").values()
+        assert (refused.outcome, refused.text) == (Outcome.REFUSED, "it has depth")
+        [absent] = rig.control(7, "led", "green").values()
+        assert (absent.outcome, absent.text) == (Outcome.REFUSED, "it is not connected")
+        with pytest.raises(ConfigurationError, match="this control cannot be sent"):
+            rig.control(None, "", True)
+    assert first.done == second.done == [("tilt_deg", 5.0)]
+
+
+def test_an_agent_that_leaves_before_it_answers_leaves_nobody_waiting(rig: Rig) -> None:
+    server = address_of(rig)
+    with SmallAgent(0, server) as agent:
+        while 0 not in rig.hellos:
+            rig.next_panorama(0.05)
+        agent.deaf = True
+        with ThreadPoolExecutor(1) as operator:
+            asked = operator.submit(rig.control, 0, "restart", True)
+            while not agent.ignored:
+                rig.next_panorama(0.05)
+            agent.leave()
+            [answer] = asked.result(20).values()
+    assert answer.outcome is Outcome.UNANSWERED

@@ -5,7 +5,7 @@ import pytest
 
 from rig_agent.simulator.ring import VirtualRig
 from rig_agent.simulator.settings import SimulatorSettings
-from rig_agent.sources.base import FrameSource
+from rig_agent.sources.base import ControlRefused, FrameSource
 from rig_agent.sources.synthetic import SyntheticSource
 from rig_protocol.errors import ConfigurationError
 from rig_protocol.frames import RgbdFrame
@@ -76,3 +76,31 @@ def test_the_description_is_the_factorys(source: FrameSource) -> None:
 def test_a_camera_the_ring_lacks_is_refused() -> None:
     with pytest.raises(ConfigurationError, match="camera 2"):
         SyntheticSource(SETTINGS, 2)
+
+
+def test_depth_that_is_switched_off_is_left_out_until_it_is_on_again(source: FrameSource) -> None:
+    source.control("depth", False)
+    off = read(source)
+    source.control("depth", True)
+    assert off.bayer is not None
+    assert off.raw is None
+    assert read(source).raw is not None
+
+
+def test_the_lamp_is_remembered(source: FrameSource) -> None:
+    source.control("led", "blink_green")
+    assert source.control("led", "green") == "the LED is green (was blink_green)"
+
+
+def test_streams_that_are_restarted_count_from_the_start(source: FrameSource) -> None:
+    read(source)
+    source.control("restart", True)
+    assert read(source).sequence == 0
+
+
+@pytest.mark.parametrize(("name", "value"), [("tilt_deg", 4.0), ("depth", "off"), ("led", 3.0)])
+def test_what_the_simulator_has_not_is_refused_and_what_it_has_named(
+    source: FrameSource, name: str, value: float | str
+) -> None:
+    with pytest.raises(ControlRefused, match="it has led"):
+        source.control(name, value)
