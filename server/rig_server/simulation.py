@@ -1,6 +1,7 @@
 """A ring of simulated agents on this machine: separate processes that stream over real loopback UDP."""
 
 import ctypes
+import json
 import os
 import signal
 import subprocess
@@ -114,9 +115,9 @@ class Simulation:
             )
 
     def _config_file(self) -> Path:
-        """An empty one, so that the settings of a real agent on this machine are not read."""
+        """What no option says; with it, the settings of a real agent on this machine are not read."""
         path = Path(self._folder.name) / "agent.toml"
-        path.touch()
+        path.write_text(f"[synthetic]\nprojector_folder = {json.dumps(self._folder.name)}\n")
         return path
 
     @property

@@ -9,7 +9,7 @@ import numpy.typing as npt
 from rig_agent.simulator.accelerometer import felt_acceleration
 from rig_agent.simulator.color_sensor import BayerSensor
 from rig_agent.simulator.foreground import PROJECTOR_BASELINE_M, LampLight, color_patches, depth_patches
-from rig_agent.simulator.kinect_noise import CleanDepth, DisparitySensor, Mask
+from rig_agent.simulator.kinect_noise import NOBODY, CleanDepth, DisparitySensor, Mask
 from rig_agent.simulator.lens import Plane, RayGrid, ray_grid
 from rig_agent.simulator.people import People, Standing
 from rig_agent.simulator.renderer import Hits, cast, cosine_of_incidence, shade
@@ -57,14 +57,16 @@ class View:
         hits = cast(self.scene.surfaces, self.T_room_depth, rays)
         z_m = _depth(hits)
         points = np.stack([rays.x * z_m, rays.y * z_m, z_m], axis=-1).reshape(-1, 3).astype(np.float64)
-        interfered = np.zeros(len(points), bool)
-        for T_room_projector in projectors:
-            interfered |= _lit(transform_points(inverse(T_room_projector) @ self.T_room_depth, points))
+        lit = tuple(
+            _lit(transform_points(inverse(T_room_projector) @ self.T_room_depth, points)).reshape(z_m.shape)
+            for T_room_projector in projectors
+        )
         return CleanDepth(
             z_m,
             cosine_of_incidence(self.scene.surfaces, hits, self.T_room_depth, rays),
             self._shadow(rays, z_m),
-            interfered.reshape(z_m.shape),
+            np.logical_or.reduce(lit) if lit else np.zeros(z_m.shape, bool),
+            lit,
         )
 
     def _shadow(self, rays: RayGrid, z_m: Plane) -> Mask:
@@ -87,10 +89,12 @@ class Sensors:
     def __init__(self, view: View, color: BayerSensor, depth: DisparitySensor | None) -> None:
         self.view, self.color, self.depth = view, color, depth
 
-    def images(self, rng: np.random.Generator, people: Sequence[Standing] = ()) -> Images:
-        """One frame of each; None where the unit measures no depth."""
+    def images(
+        self, rng: np.random.Generator, people: Sequence[Standing] = (), dark: frozenset[int] = NOBODY
+    ) -> Images:
+        """One frame of each; None where the unit measures no depth. `dark`: as in DisparitySensor.frame."""
         if not people:
-            return self.color.frame(rng), None if self.depth is None else self.depth.frame(rng)
+            return self.color.frame(rng), None if self.depth is None else self.depth.frame(rng, (), dark)
         view = self.view
         covers = color_patches(view.scene, people, view.T_room_color, self._color_rays, COLOR_SAMPLES)
         color = self.color.frame(rng, self._lamp.left_by(people), covers)
@@ -98,7 +102,7 @@ class Sensors:
             return color, None
         projector = projector_pose(view.T_room_depth)
         patches = depth_patches(self.depth.clean, people, view.T_room_depth, self._depth_rays, projector)
-        return color, self.depth.frame(rng, patches)
+        return color, self.depth.frame(rng, patches, dark)
 
     @cached_property
     def _color_rays(self) -> RayGrid:
@@ -122,7 +126,7 @@ class VirtualKinect:
         self._settings, self._scene = settings, scene
         self._people = People(settings, scene)
         self._rendered: dict[bool, Sensors] = {}
-        self._loop: dict[tuple[bool, int], Images] = {}
+        self._loop: dict[tuple[bool, int, frozenset[int]], Images] = {}
 
     @cached_property
     def unit(self) -> VirtualUnit:
@@ -171,10 +175,21 @@ class VirtualKinect:
         felt_g = felt_acceleration(self._settings, self.id, self._moment(k), -R_room_color[2])
         return Gravity.along(felt_g)
 
-    def frame(self, k: int) -> RgbdFrame:
-        """Frame k, stamped as if frame 0 was taken at `phase_ns`; all repeats after `frames_rendered`."""
+    @cached_property
+    def neighbours(self) -> tuple[int, ...]:
+        """Slots of the Kinects whose projectors reach into this one's view."""
+        pairs = [pair for pair in self._settings.overlaps if self.id in pair]
+        return tuple(sorted({i for pair in pairs for i in pair} - {self.id}))
+
+    def frame(self, k: int, dark: frozenset[int] = NOBODY) -> RgbdFrame:
+        """Frame k, stamped as if frame 0 was taken at `phase_ns`; all repeats after `frames_rendered`.
+
+        `dark`: slots of neighbours whose projectors are off.
+        """
         moment = self._moment(k)
-        images = self._looped(k, moment) if self._settings.frames_rendered else self._images(k, moment)
+        off = frozenset(n for n, i in enumerate(self.neighbours) if i in dark)
+        rendered = self._looped if self._settings.frames_rendered else self._images
+        images = rendered(k, moment, off)
         return RgbdFrame(
             camera_id=self.id,
             sequence=k,
@@ -189,17 +204,17 @@ class VirtualKinect:
         loop = self._settings.frames_rendered
         return k % loop if loop else k
 
-    def _looped(self, k: int, moment: int) -> Images:
-        key = (self._knocked(k), moment)
+    def _looped(self, k: int, moment: int, off: frozenset[int]) -> Images:
+        key = (self._knocked(k), moment, off)
         if key not in self._loop:
-            self._loop[key] = self._images(k, moment)
+            self._loop[key] = self._images(k, moment, off)
         return self._loop[key]
 
-    def _images(self, k: int, moment: int) -> Images:
+    def _images(self, k: int, moment: int, off: frozenset[int]) -> Images:
         """What is seen from the place of frame k, with the people and the noise of the frame `moment`."""
         rng = generator(self._settings.seed, Stream.FRAME, self.id, moment)
         time_ns = self.phase_ns + moment * self.frame_interval_ns
-        return self._sensors(k).images(rng, self._people.at(time_ns / 1e9))
+        return self._sensors(k).images(rng, self._people.at(time_ns / 1e9), off)
 
     def _sensors(self, k: int) -> Sensors:
         """Both sensors in front of the scene as it is seen at frame k; rendered once a place."""
@@ -222,14 +237,13 @@ class VirtualKinect:
         return knock is not None and knock.camera == self.id and k >= knock.from_frame
 
     def _neighbouring_projectors(self, k: int) -> list[Pose]:
-        neighbours = {i for pair in self._settings.overlaps if self.id in pair for i in pair} - {self.id}
         return [
             projector_pose(
                 self._scene.T_room_rig
                 @ draw_T_rig_camera(self._settings, i, k)
                 @ draw_unit(self._settings, i).T_color_depth
             )
-            for i in sorted(neighbours)
+            for i in self.neighbours
         ]
 
 

@@ -36,12 +36,16 @@ _FROZEN_HOLES = 0.7  # interference flickers at the rims of holes that mostly st
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CleanDepth:
-    """What an ideal depth camera of the same place sees; all (rows, columns)."""
+    """What an ideal depth camera of the same place sees; all (rows, columns).
+
+    `interfered`: where any neighbour's projector reaches; `lit`: where each of them does.
+    """
 
     z_m: Plane
     cosine: Plane
     shadow: Mask
     interfered: Mask
+    lit: tuple[Mask, ...] = ()
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -50,6 +54,27 @@ class DepthPatch:
 
     window: tuple[slice, slice]
     clean: CleanDepth
+
+
+NOBODY: frozenset[int] = frozenset()
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Interference:
+    """What neighbours' dots do: no depth where `holes` is positive, `error` (LSB) on the disparity."""
+
+    holes: Plane | None
+    error: Plane | None
+
+    def within(self, lit: Mask) -> "_Interference":
+        """The same where there is light, nothing elsewhere."""
+        if not lit.any():
+            return _Interference(None, None)
+        holes, error = self.holes, self.error
+        return _Interference(
+            None if holes is None else np.where(lit, holes, np.float32(-100)),
+            None if error is None else np.where(lit, error, np.float32(0)),
+        )
 
 
 class DisparitySensor:
@@ -72,23 +97,44 @@ class DisparitySensor:
         self._frozen = np.sqrt(settings.frozen_noise) * correlated_noise(rng, shape)
         self._base, self._fresh_sigma, self._invalid = self._measured(DepthPatch(np.s_[:, :], clean))
         self._bank = NoiseBank(rng, shape, correlated=True)
-        self._holes = _hole_field(rng, clean.interfered, settings.interference)
+        self._interference = {
+            NOBODY: _Interference(
+                _hole_field(rng, clean.interfered, settings.interference),
+                _dot_error(rng, clean.interfered, settings.interference_noise_lsb),
+            )
+        }
 
-    def frame(self, rng: np.random.Generator, patches: Sequence[DepthPatch] = ()) -> ImageU16:
-        """One frame, 11 bit, 2047 = none; `patches`: where something stands in front of the scene."""
+    def frame(
+        self, rng: np.random.Generator, patches: Sequence[DepthPatch] = (), dark: frozenset[int] = NOBODY
+    ) -> ImageU16:
+        """One frame, 11 bit, 2047 = none; `patches`: where something stands in front of the scene.
+
+        `dark`: which of the projectors in `clean.lit` are off.
+        """
         base, sigma, invalid = self._base, self._fresh_sigma, self._invalid
         if patches:
             base, sigma, invalid = base.copy(), sigma.copy(), invalid.copy()
         for patch in patches:
             base[patch.window], sigma[patch.window], invalid[patch.window] = self._measured(patch)
+        interference = self._interference_without(dark)
+        if interference.error is not None:
+            base = base + interference.error
         measured = cv2.add(base, cv2.multiply(sigma, self._bank.draw(rng)), dtype=cv2.CV_16U)
         raw: ImageU16 = np.asarray(measured, dtype=np.uint16)
         raw[invalid] = NO_DISPARITY
         raw[:, -BLIND_COLUMNS:] = NO_DISPARITY
-        if self._holes is not None:
+        if interference.holes is not None:
             flicker = self._bank.draw(rng)
-            raw[cv2.scaleAdd(flicker, np.sqrt(1 - _FROZEN_HOLES), self._holes) > 0] = NO_DISPARITY
+            raw[cv2.scaleAdd(flicker, np.sqrt(1 - _FROZEN_HOLES), interference.holes) > 0] = NO_DISPARITY
         return raw
+
+    def _interference_without(self, dark: frozenset[int]) -> "_Interference":
+        """What is left of it while some projectors are off."""
+        if dark not in self._interference:
+            shining = [mask for k, mask in enumerate(self.clean.lit) if k not in dark]
+            lit = np.logical_or.reduce(shining) if shining else np.zeros_like(self.clean.interfered)
+            self._interference[dark] = self._interference[NOBODY].within(lit)
+        return self._interference[dark]
 
     def _measured(self, patch: DepthPatch) -> tuple[Plane, Plane, Mask]:
         """On a window: disparity without fresh noise, the sigma of that, and where nothing is measured."""
@@ -154,6 +200,17 @@ def _with_ragged_edges(z_m: Plane, jitter: tuple[Plane, Plane]) -> Plane:
     ragged = z_m.copy()
     ragged[rows, columns] = z_m[moved[0], moved[1]]
     return ragged
+
+
+def _dot_error(rng: np.random.Generator, interfered: Mask, sigma_lsb: float) -> Plane | None:
+    """What foreign dots in the correlation window add to the disparity.
+
+    Both patterns stand still, and so does the error: averaging frames does not help against it.
+    """
+    if sigma_lsb <= 0 or not interfered.any():
+        return None
+    field = sigma_lsb * correlated_noise(rng, (interfered.shape[0], interfered.shape[1]))
+    return np.asarray(np.where(interfered, field, 0), dtype=np.float32)
 
 
 def _hole_field(rng: np.random.Generator, interfered: Mask, share: float) -> Plane | None:

@@ -1,5 +1,6 @@
 """What a simulated rig is made of: the reference scene by default, and knobs for robustness studies."""
 
+from pathlib import Path
 from typing import Annotated, Self
 
 from pydantic import Field, model_validator
@@ -77,6 +78,11 @@ class SimulatorSettings(Settings):
     """Share of the disparity noise's variance that stays the same over frames."""
     interference: float = Field(0.02, ge=0, le=0.5)
     """Share of pixels that the neighbours' projectors spoil where they overlap."""
+    interference_noise_lsb: float = Field(0.0, ge=0, le=20)
+    """Error that neighbours' dots add where their projectors reach, one sigma: like the dots, it stays."""
+    projector_folder: Path | None = None
+    """Folder in which simulated Kinects of this machine tell each other that their projectors are off; unset:
+    all shine, all the time."""
     exposure_spread: float = Field(0.12, ge=0, le=1)
     """Spread of the cameras' exposures, natural logarithm."""
 

@@ -6,10 +6,13 @@ from dataclasses import replace
 from types import TracebackType
 from typing import Self
 
+from rig_agent.simulator.projectors import ProjectorLights
 from rig_agent.simulator.ring import VirtualRig
 from rig_agent.simulator.settings import SimulatorSettings
 from rig_agent.sources.base import ControlRefused, ControlValue, SourceDescription
 from rig_protocol.frames import RgbdFrame
+
+_SETTLING_NS = 200_000_000  # from a projector that is switched on to the first depth
 
 
 class SyntheticSource:
@@ -34,7 +37,9 @@ class SyntheticSource:
         self._clock, self._sleep = clock, sleep
         self._counters = {"skipped": 0}
         self._has_depth = self._kinect.frame(0).raw is not None
-        self._depth_on, self._led = True, "green"
+        self._lights = ProjectorLights(settings.projector_folder, camera)
+        self._depth_from_ns: int | None = 0  # when depth comes again; None: it is off
+        self._led = "green"
         self._interval_ns, self._next = self._kinect.frame_interval_ns, 0
         self._start_ns = self._first_frame_ns()
 
@@ -70,8 +75,10 @@ class SyntheticSource:
         if wait_s > 0:
             self._sleep(wait_s)
         number, self._next = self._next, self._next + 1
-        frame = replace(self._kinect.frame(number), timestamp_ns=taken_ns)
-        return frame if self._depth_on else replace(frame, raw=None)
+        dark = self._lights.dark(self._kinect.neighbours)
+        frame = replace(self._kinect.frame(number, dark), timestamp_ns=taken_ns)
+        measured = self._depth_from_ns is not None and taken_ns >= self._depth_from_ns
+        return frame if measured else replace(frame, raw=None)
 
     def control(self, name: str, value: ControlValue) -> str:
         """`led` (remembered, nobody sees it), `depth` and `restart`."""
@@ -80,8 +87,7 @@ class SyntheticSource:
                 before, self._led = self._led, value
                 return f"the LED is {value} (was {before})"
             case "depth", bool():
-                self._depth_on = value
-                return "depth and its projector are " + ("on" if value else "off")
+                return self._switch_depth(value)
             case "restart", bool():
                 self._start_ns, self._next = self._first_frame_ns(), 0
                 return "the streams start anew"
@@ -89,13 +95,22 @@ class SyntheticSource:
             f"the simulator cannot set {name} to {value!r}; it has led (a word), depth (on, off) and restart"
         )
 
+    def _switch_depth(self, on: bool) -> str:
+        was_off = self._depth_from_ns is None
+        self._lights.shine(on)
+        if not on:
+            self._depth_from_ns = None
+        elif was_off:
+            self._depth_from_ns = self._clock() + _SETTLING_NS
+        return "depth and its projector are " + ("on" if on else "off")
+
     def _first_frame_ns(self) -> int:
         """When frame 0 is taken if streaming starts now."""
         interval_ns, phase_ns = self._interval_ns, self._kinect.phase_ns
         return phase_ns + ((self._clock() - phase_ns) // interval_ns + 1) * interval_ns
 
     def close(self) -> None:
-        """Nothing to release."""
+        """Nothing to release; the next who opens it finds the projector on."""
 
     def __enter__(self) -> Self:
         """The source itself."""

@@ -150,3 +150,31 @@ def test_edges_of_depth_are_ragged_and_planes_stay() -> None:
     assert 0.3 < edge.std() < 2.0
     assert not near[:, :310].any()
     assert near[:, 330:-BLIND_COLUMNS].all()
+
+
+def lit_halves() -> CleanDepth:
+    """A wall on which one neighbour lights the left half, another the right half."""
+    left = np.zeros(SHAPE, bool)
+    left[:, : SHAPE[1] // 2] = True
+    return replace(clean_depth(slanted_wall()), interfered=np.ones(SHAPE, bool), lit=(left, ~left))
+
+
+def test_a_dark_projector_disturbs_nothing_and_the_others_as_before() -> None:
+    settings = PLAIN.model_copy(update={"interference": 0.3, "interference_noise_lsb": 3.0})
+    sensor = DisparitySensor(np.random.default_rng(0), lit_halves(), MODEL, settings)
+XX
+    half = SHAPE[1] // 2
+    np.testing.assert_array_equal(left_dark[:, half:], both[:, half:])
+    assert (both[:, :half] == NO_DISPARITY).mean() > 0.2
+    assert not (left_dark[:, :half] == NO_DISPARITY).any()
+    undisturbed = DisparitySensor(np.random.default_rng(0), clean_depth(slanted_wall()), MODEL, PLAIN)
+    np.testing.assert_array_equal(none, undisturbed.frame(np.random.default_rng(1)))
+
+
+def test_the_error_by_foreign_dots_has_its_size_and_stands_still() -> None:
+    settings = PLAIN.model_copy(update={"interference_noise_lsb": 3.0})
+    sensor = DisparitySensor(np.random.default_rng(0), lit_halves(), MODEL, settings)
+    ideal = MODEL.offset - MODEL.numerator_m / slanted_wall()
+    frames = np.array([sensor.frame(np.random.default_rng(k)) for k in range(8)]) - ideal
+    seen = frames.mean(axis=0)[:, :-BLIND_COLUMNS]
+    assert seen.std() == pytest.approx(3.0, rel=0.1)

@@ -1,5 +1,7 @@
 """Rules of the synthetic source: free-running on a clock, as hardware is."""
 
+from pathlib import Path
+
 import numpy as np
 import pytest
 
@@ -8,7 +10,7 @@ from rig_agent.simulator.settings import SimulatorSettings
 from rig_agent.sources.base import ControlRefused, FrameSource
 from rig_agent.sources.synthetic import SyntheticSource
 from rig_protocol.errors import ConfigurationError
-from rig_protocol.frames import RgbdFrame
+from rig_protocol.frames import NO_DISPARITY, RgbdFrame
 from support.virtual_time import VirtualTime
 
 SETTINGS = SimulatorSettings(cameras=2, seed=3, frames_rendered=1)
@@ -78,13 +80,35 @@ def test_a_camera_the_ring_lacks_is_refused() -> None:
         SyntheticSource(SETTINGS, 2)
 
 
-def test_depth_that_is_switched_off_is_left_out_until_it_is_on_again(source: FrameSource) -> None:
+def test_depth_that_is_switched_off_is_left_out_until_it_is_on_again_and_settled(
+    source: FrameSource, clock: VirtualTime
+) -> None:
     source.control("depth", False)
     off = read(source)
     source.control("depth", True)
     assert off.bayer is not None
     assert off.raw is None
+    assert read(source).raw is None
+    clock.sleep(0.2)
     assert read(source).raw is not None
+
+
+def test_neighbours_in_other_processes_see_that_a_projector_is_dark(
+    clock: VirtualTime, tmp_path: Path
+) -> None:
+    settings = SETTINGS.model_copy(update={"projector_folder": tmp_path, "interference": 0.4})
+    one, other = (SyntheticSource(settings, i, clock=clock, sleep=clock.sleep) for i in (0, 1))
+    clear = VirtualRig(SETTINGS.model_copy(update={"interference": 0.0})).camera(0).frame(0).raw
+    disturbed = read(one).raw
+    other.control("depth", False)
+    alone = read(one).raw
+    other.control("depth", True)
+    again = read(one).raw
+    assert clear is not None
+    assert disturbed is not None
+    np.testing.assert_array_equal(alone, clear)
+    np.testing.assert_array_equal(again, disturbed)
+    assert (disturbed == NO_DISPARITY).mean() > 0.05 + (clear == NO_DISPARITY).mean()
 
 
 def test_the_lamp_is_remembered(source: FrameSource) -> None:
