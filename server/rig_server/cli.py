@@ -36,6 +36,8 @@ _EXAMPLES = """
 
 `rig-server --calibrate --coach --target-mm 3` — the same, until it is that good: hang patterns meanwhile
 
+`rig-server --calibrate --projector-groups 2` — the same, no neighbour's projector on at the same time
+
 `rig-server --calibrate --recalibrate cam04` — one camera was knocked: find it, keep all others
 
 `rig-server control cam03 depth off` — have one camera of the running rig do something (`--list`: what)
@@ -100,6 +102,12 @@ def run(
             "--coach", help="Go on with fresh sets until every overlap holds: hang patterns meanwhile."
         ),
     ] = False,
+    projector_groups: Annotated[
+        int | None,
+        typer.Option(
+            metavar="N", min=1, max=3, help="Capture in 2 or 3 turns, no neighbour's projector on; else 1."
+        ),
+    ] = None,
     recalibrate: Annotated[
         str | None,
         typer.Option(metavar="CAMERA", help="Find only this one (name or id) anew, keep all others."),
@@ -137,6 +145,7 @@ def run(
             "--target-mm": target_mm,
             "--target-deg": target_deg,
             "--coach": coach or None,
+            "--projector-groups": projector_groups,
             "--recalibrate": recalibrate,
             "--calibration": calibration,
             "--out": out,
@@ -152,7 +161,12 @@ def run(
         "listen": listen,
         "insecure": insecure or None,
         "metrics": metrics,
-        "capture": {"frames": frames, "target_mm": target_mm, "target_deg": target_deg},
+        "capture": {
+            "frames": frames,
+            "target_mm": target_mm,
+            "target_deg": target_deg,
+            "projector_groups": projector_groups,
+        },
         "calibration": {"method": method},
         "watch": {"calibration": watch},
     }

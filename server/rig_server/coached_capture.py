@@ -8,6 +8,7 @@ from rig_protocol.frames import PanoramicFrame
 from rig_server.background_work import BackgroundWork
 from rig_server.calibration_task import CalibrationTask, Estimate
 from rig_server.coach_display import CoachDisplay
+from rig_server.grouped_sets import SetSource, sets_of
 from rig_server.rig import Rig
 from rig_server.sinks.calibrate import CalibrateSink
 
@@ -20,13 +21,13 @@ def coached_capture(rig: Rig, task: CalibrationTask, display: CoachDisplay) -> E
     Closes the rig as soon as it needs no more sets. RigError when no frame comes, or when the calibration's
     input is unusable.
     """
-    with BackgroundWork[Estimate]("calibration") as work:
+    with BackgroundWork[Estimate]("calibration") as work, sets_of(rig, task.settings.capture) as sets:
         while True:
-            estimate = _Round(rig, task, display, work).run()
+            estimate = _Round(sets, task, display, work).run()
             if not task.coached or task.contents(estimate):
                 return estimate
             _skip_waiting_sets(rig)
-            if rig.ended:  # nobody can hang a pattern into a recording
+            if sets.ended:  # nobody can hang a pattern into a recording
                 return estimate
 
 
@@ -39,7 +40,7 @@ class _Round:
     """
 
     def __init__(
-        self, rig: Rig, task: CalibrationTask, display: CoachDisplay, work: BackgroundWork[Estimate]
+        self, rig: SetSource, task: CalibrationTask, display: CoachDisplay, work: BackgroundWork[Estimate]
     ) -> None:
         capture = task.settings.capture
         self._rig, self._task, self._display, self._work = rig, task, display, work

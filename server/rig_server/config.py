@@ -108,6 +108,8 @@ class CaptureSettings(Settings):
     """End as soon as every pair of neighbours is expected to be known this well (root mean square)."""
     target_mm: float | None = Field(None, gt=0, le=10_000, examples=[3.0])
     """The same for their distance; with both, both must hold. What K frames do not reach is a failure."""
+    projector_groups: int = Field(1, ge=1, le=3)
+    """In how many turns the projectors shine, so that none shines into a neighbour's view; 1: all at once."""
     wait_s: float = Field(60.0, gt=0, le=86_400)
     """How long to wait for the expected cameras, and then for complete sets."""
 

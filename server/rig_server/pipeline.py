@@ -5,7 +5,7 @@ import secrets
 import threading
 import time
 from collections import deque
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 
 from rig_protocol.codecs import COLOR_CODECS, DEPTH_CODECS
 from rig_protocol.errors import RigError
@@ -147,11 +147,14 @@ class LivePipeline:
         """The rig at this moment; any thread may ask."""
         return self._status.read(self.hellos)
 
-    def control(self, camera: int | None, name: str, value: ControlValue) -> Mapping[int, ControlAnswered]:
-        """Have one agent, or every connected one, do something; the answers by camera id."""
+    def control(
+        self, cameras: int | Collection[int] | None, name: str, value: ControlValue
+    ) -> Mapping[int, ControlAnswered]:
+        """Have these agents, or every connected one, do something; the answers by camera id."""
         with self._presence:
             connected = set(self._connected)
-        return self._remote.control(connected if camera is None else {camera}, name, value)
+        chosen = connected if cameras is None else {cameras} if isinstance(cameras, int) else cameras
+        return self._remote.control(chosen, name, value)
 
     def _check_receiver(self) -> None:
         if self._receiver.failure is not None:

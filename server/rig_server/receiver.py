@@ -16,6 +16,7 @@ from collections.abc import Callable, Iterable
 from typing import Protocol
 
 from rig_protocol.datagram import DatagramBatch
+from rig_protocol.errors import RigError
 from rig_protocol.events import Address, ServerEvent
 from rig_server.gatherer import Gatherer
 from rig_server.udp_socket import ask_for_receive_buffer, bound_udp_socket, switch_on, waiting_bytes
@@ -120,9 +121,14 @@ class Receiver:
         self._thread.start()
 
     def post(self, work: Callable[[int], None]) -> None:
-        """Have something done soon on the receiver's thread, alone with the link; it gets the rig time."""
+        """Have something done soon on the receiver's thread, alone with the link; it gets the rig time.
+
+        RigError when it does not run.
+        """
+        if self._stopping.is_set() or not self._thread.is_alive():
+            raise RigError("the server does not run")
         self._posted.append(work)
-        with contextlib.suppress(OSError):  # already stopped: it will not be done
+        with contextlib.suppress(OSError):  # it stops this very moment
             self._waker.send(b"\0")
 
     def stop(self) -> None:

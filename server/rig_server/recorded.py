@@ -1,7 +1,7 @@
 """A rig folder read as panoramic frames."""
 
 from collections import deque
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from pathlib import Path
 
 from rig_protocol.errors import ConfigurationError, RigError
@@ -69,7 +69,12 @@ class RecordedRig:
         self._partial += not panorama.complete
         return panorama
 
-    def control(self, camera: int | None, name: str, value: ControlValue) -> Mapping[int, ControlAnswered]:  # noqa: ARG002  # of no use here
+    def control(
+        self,
+        cameras: int | Collection[int] | None,  # noqa: ARG002  # as every feed has it
+        name: str,
+        value: ControlValue,  # noqa: ARG002
+    ) -> Mapping[int, ControlAnswered]:
         """A recording cannot be told anything: RigError."""
         raise RigError(f"{self.place} is a recording: nobody is there to set {name}")
 

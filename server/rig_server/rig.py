@@ -3,7 +3,7 @@
 import re
 import secrets
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping
 from dataclasses import replace
 from pathlib import Path
 from types import TracebackType
@@ -73,8 +73,10 @@ class Feed(Protocol):
         """The next set, or None when none came in time; RigError when the feed broke."""
         ...
 
-    def control(self, camera: int | None, name: str, value: ControlValue) -> Mapping[int, ControlAnswered]:
-        """Have one agent, or every connected one, do something; the answers by camera id."""
+    def control(
+        self, cameras: int | Collection[int] | None, name: str, value: ControlValue
+    ) -> Mapping[int, ControlAnswered]:
+        """Have these agents, or every connected one, do something; the answers by camera id."""
         ...
 
     def status(self) -> RigStatus:
@@ -192,13 +194,15 @@ class Rig:
                 on_wait(self.status())
             time.sleep(_POLL_S)
 
-    def control(self, camera: int | None, name: str, value: ControlValue) -> Mapping[int, ControlAnswered]:
-        """Have one camera (None: every connected one) do something, and wait; answers by camera id.
+    def control(
+        self, cameras: int | Collection[int] | None, name: str, value: ControlValue
+    ) -> Mapping[int, ControlAnswered]:
+        """Have cameras (None: every connected one) do something, and wait; answers by camera id.
 
         Names and values are those of docs/control.md. Any thread may ask. ConfigurationError for what cannot
         be told at all; what an agent refuses is an outcome, no error. RigError for a recording.
         """
-        return self._feed.control(camera, name, value)
+        return self._feed.control(cameras, name, value)
 
     @property
     def description(self) -> RigDescription:

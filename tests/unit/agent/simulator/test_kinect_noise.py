@@ -162,7 +162,9 @@ def lit_halves() -> CleanDepth:
 def test_a_dark_projector_disturbs_nothing_and_the_others_as_before() -> None:
     settings = PLAIN.model_copy(update={"interference": 0.3, "interference_noise_lsb": 3.0})
     sensor = DisparitySensor(np.random.default_rng(0), lit_halves(), MODEL, settings)
-XX
+    both, left_dark, none = (
+        sensor.frame(np.random.default_rng(1), dark=frozenset(dark)) for dark in ((), (0,), (0, 1))
+    )
     half = SHAPE[1] // 2
     np.testing.assert_array_equal(left_dark[:, half:], both[:, half:])
     assert (both[:, :half] == NO_DISPARITY).mean() > 0.2
