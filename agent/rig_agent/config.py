@@ -16,6 +16,7 @@ from rig_protocol.settings import Settings, load_settings
 ENVIRONMENT_PREFIX = "RIG_AGENT_"
 CONFIG_PLACES = (Path("agent.toml"), Path("/etc/kinect-rig/agent.toml"))
 DEFAULT_PORT = 4012
+AUTO = "auto"
 
 SourceName = Literal["freenect", "folder", "synthetic"]
 Manner = Literal["lossless", "jpeg", "raw"]
@@ -43,8 +44,8 @@ class PacingSettings(Settings):
 class AgentSettings(Settings):
     """Settings of rig-agent. Remove the # before a key to change it; shown are the defaults."""
 
-    server: str = Field("127.0.0.1:4012", examples=["rig-server.local:4012"])
-    """Where rig-server listens: HOST:PORT or HOST."""
+    server: str = Field(AUTO, examples=["rig-server.local:4012"])
+    """Where rig-server listens: HOST:PORT or HOST; `auto`: where one announces itself by mDNS."""
     source: SourceName = "freenect"
     """Where frames come from: a Kinect, a recorded rig folder or the simulator."""
     camera: int | None = Field(None, ge=0, lt=64, examples=[0])
@@ -79,13 +80,14 @@ class AgentSettings(Settings):
     @field_validator("server")
     @classmethod
     def _server_is_an_address(cls, text: str) -> str:
-        _parse_address(text)
+        if text != AUTO:
+            _parse_address(text)
         return text
 
     @property
-    def address(self) -> Address:
-        """`server` as (host, port)."""
-        return _parse_address(self.server)
+    def address(self) -> Address | None:
+        """`server` as (host, port); None where one is to be found."""
+        return None if self.server == AUTO else _parse_address(self.server)
 
     def display_name(self, slot: int | None) -> str:
         """The name, or the one that follows from the slot, or from the machine."""

@@ -8,6 +8,7 @@ import struct
 import time
 from dataclasses import dataclass
 
+from rig_agent.discovery import ServerFinder
 from rig_protocol.datagram import DatagramBatch
 from rig_protocol.events import Address
 
@@ -23,6 +24,10 @@ _MAX_SEND_BYTES = 65_507
 _NO_SEGMENTATION = {errno.EINVAL, errno.EIO, errno.ENOPROTOOPT, errno.EOPNOTSUPP}
 _BUSY = {errno.EAGAIN, errno.EWOULDBLOCK, errno.ENOBUFS}
 _MAX_DATAGRAMS_A_WAKE = 64  # so that a flood of datagrams cannot hold up sending
+_NOBODY = (
+    "no server has announced itself on this network yet: set `server` to its address, or look whether it "
+    "runs with `announce = true`"
+)
 _RECEIVE_BYTES = 2048  # control messages are never split and fit one Ethernet frame
 
 
@@ -46,9 +51,10 @@ def now_ns() -> int:
 class Transport:
     """One server at a time. `open` resolves the name anew, so it is also the cure for a changed address."""
 
-    def __init__(self, server: Address) -> None:
-        """Open nothing yet."""
-        self._server = server
+    def __init__(self, server: Address | None) -> None:
+        """Open nothing yet; without a server, one that announces itself is looked for at every opening."""
+        self._finder = ServerFinder() if server is None else None
+        self._server = server or ("", 0)
         self._socket: socket.socket | None = None
         self._segmentation = True
         self._rate = 0
@@ -57,7 +63,9 @@ class Transport:
 
     def open(self) -> bool:
         """(Re)connect; False, with the reason logged once, when name or route is missing."""
-        self.close()
+        self._close_socket()
+        if self._finder is not None and not self._find(self._finder):
+            return False
         try:
             family, address = _resolve(self._server)
             self._socket = socket.socket(family, socket.SOCK_DGRAM | socket.SOCK_NONBLOCK)
@@ -66,9 +74,14 @@ class Transport:
                 self.limit_rate(self._rate)
         except OSError as error:
             self._note(error)
-            self.close()
+            self._close_socket()
             return False
         return True
+
+    @property
+    def server(self) -> str:
+        """Where it sends to, for the operator."""
+        return "{}:{}".format(*self._server)
 
     def limit_rate(self, bytes_per_s: float) -> None:
         """Let the kernel space the datagrams of a burst (SO_MAX_PACING_RATE).
@@ -131,6 +144,20 @@ class Transport:
 
     def close(self) -> None:
         """Close the socket; harmless when closed."""
+        self._close_socket()
+        if self._finder is not None:
+            self._finder.close()
+
+    def _find(self, finder: ServerFinder) -> bool:
+        found = finder.next_address()
+        if found is not None:
+            self._server = found
+        elif self._last_error != _NOBODY:
+            _log.warning("%s; trying on", _NOBODY)
+            self._last_error = _NOBODY
+        return found is not None
+
+    def _close_socket(self) -> None:
         if self._socket is not None:
             self._socket.close()
             self._socket = None

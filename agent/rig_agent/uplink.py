@@ -54,7 +54,6 @@ class Uplink:
         read_system_clock: Callable[[], SystemClockReading] | None = None,
     ) -> None:
         """Silent until `introduce`."""
-        self._server = settings.server
         self._rig_key = rig_key
         self._read_system_clock = read_system_clock
         self._datagram_size = settings.datagram_size
@@ -231,15 +230,20 @@ class Uplink:
                 self.connections += 1
                 self._refusal = ""
                 self._transport.server_reached()
-                _log.info("connected to %s as camera %d", self._server, welcome.camera_id)
+                _log.info("connected to %s as camera %d", self._transport.server, welcome.camera_id)
             case Rejected(reason, text):
                 if text != self._refusal:
-                    _log.error("%s refuses this camera (%s): %s; trying on", self._server, reason.name, text)
+                    _log.error(
+                        "%s refuses this camera (%s): %s; trying on",
+                        self._transport.server,
+                        reason.name,
+                        text,
+                    )
                 self._refusal = text
             case Disconnected(text):
                 self._pacer.clear()
                 self._news.append(event)
-                _log.warning("lost %s: %s; trying on", self._server, text)
+                _log.warning("lost %s: %s; trying on", self._transport.server, text)
             case ControlRequested():
                 self._news.append(event)
 

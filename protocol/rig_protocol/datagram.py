@@ -19,6 +19,8 @@ Buffer = bytes | bytearray | memoryview
 
 MAGIC = b"KR"
 VERSION = 2
+SERVICE_TYPE = "_kinect-rig._udp.local."
+"""Under which servers announce themselves by mDNS."""
 
 # 1500 (Ethernet) - 20 (IPv4) - 8 (UDP).
 DEFAULT_DATAGRAM_SIZE = 1472

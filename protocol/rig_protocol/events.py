@@ -1,6 +1,6 @@
 """What a link tells its owner: the only things that come out of `next_event()`."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from enum import StrEnum
 
 from rig_protocol.frames import EncodedFrame
@@ -69,11 +69,15 @@ class CameraLeft:
 
 @dataclass(frozen=True, slots=True)
 class HelloRefused:
-    """A hello was answered with a reject; at most one event a second and address."""
+    """A hello was answered with a reject; at most one event a second and address.
+
+    `hello`: what it said, where it holds the rig's key and its content is in order.
+    """
 
     address: Address
     reason: RejectReason
     text: str
+    hello: Hello | None = field(default=None, compare=False)  # its camera model holds arrays
 
 
 @dataclass(frozen=True, slots=True)

@@ -74,7 +74,8 @@ class Reception:
     ) -> None:
         """Looks at `sessions`, counts into `rejected`."""
         self._objection = objection
-        self._roster, self._terms, self._sessions = roster, terms, sessions
+        self.roster = roster
+        self._terms, self._sessions = terms, sessions
         self._rig_key, self._random_bytes = rig_key, random_bytes
         self._rejected, self._send, self._tell = rejected, send, tell
         self._closed = False
@@ -108,9 +109,9 @@ class Reception:
         elif prefix.version != VERSION:
             self._refuse(version_mismatch(prefix.version), prefix.id, address, now_ns)
         else:
-            refusal = self._take_hello(prefix.id, datagram, address, now_ns)
+            refusal, hello = self._take_hello(prefix.id, datagram, address, now_ns)
             if refusal is not None:
-                self._refuse(refusal, prefix.id, address, now_ns)
+                self._refuse(refusal, prefix.id, address, now_ns, hello)
 
     def confirm(
         self, session_id: int, datagram: Buffer, address: Address, now_ns: int
@@ -134,37 +135,37 @@ class Reception:
         if session_id not in self._pending and self._may_notify(address, now_ns):
             self._send(encode_clear(*encode_body(UnknownSession()), session_id), address)
 
-    def _take_hello(self, nonce: int, datagram: Buffer, address: Address, now_ns: int) -> Reject | None:
-        """Answer a hello, or say why not."""
+    def _take_hello(
+        self, nonce: int, datagram: Buffer, address: Address, now_ns: int
+    ) -> tuple[Reject | None, Hello | None]:
+        """Answer a hello, or say why not; with what it says, where that was read."""
         if self._pending.was_used(nonce):
             self._rejected["stale_hello"] += 1  # a copy of an old one
-            return None
+            return None, None
         known = self._pending.of_hello(nonce, address)
         if known is not None:
             self._send(known.welcome_datagram, address)  # our answer was lost
-            return None
+            return None, None
         try:
             body = open_hello(datagram, nonce, self._rig_key)
             # What follows takes time, and the hello may be a recorded one. An agent tries again in a moment.
             if not (self._repeats.allows(nonce, now_ns) and self._handshakes.allows("all", now_ns)):
                 self._rejected["handshake_limit"] += 1
-                return None
+                return None, None
             hello = decode_hello(body)
         except NotAuthentic:
-            return wrong_key(self._rig_key.is_public)
+            return wrong_key(self._rig_key.is_public), None
         except DataError as error:
-            return malformed_hello(error)
+            return malformed_hello(error), None
         welcome = self._choose(hello, address, now_ns)
         if isinstance(welcome, Reject):
-            return welcome
+            return welcome, hello
         self._answer(nonce, datagram, hello, welcome, address, now_ns)
-        return None
+        return None, hello
 
     def _choose(self, hello: Hello, address: Address, now_ns: int) -> Welcome | Reject:
         sessions, terms = self._sessions, self._terms
-        camera_id = self._roster.assign(
-            hello, sessions.recall(hello, address), sessions.taken(hello, address)
-        )
+        camera_id = self.roster.assign(hello, sessions.recall(hello, address), sessions.taken(hello, address))
         if isinstance(camera_id, Reject):
             return camera_id
         holder = sessions.of_camera(camera_id)
@@ -196,12 +197,14 @@ class Reception:
         self._pending.add(PendingSession(hello, nonce, address, agreement, answer, now_ns))
         self._send(answer, address)
 
-    def _refuse(self, reject: Reject, nonce: int, address: Address, now_ns: int) -> None:
+    def _refuse(
+        self, reject: Reject, nonce: int, address: Address, now_ns: int, hello: Hello | None = None
+    ) -> None:
         self._rejected[f"refused_{reject.reason.name.lower()}"] += 1
         if self._may_notify(address, now_ns):
             self._send(encode_clear(*encode_body(reject), nonce), address)
         if self._refusal_events.allows(address[0], now_ns) and self._all_refusal_events.allows("all", now_ns):
-            self._tell(HelloRefused(address, reject.reason, reject.text))
+            self._tell(HelloRefused(address, reject.reason, reject.text, hello))
 
     def _may_notify(self, address: Address, now_ns: int) -> bool:
         return self._notices.allows(address, now_ns) and self._all_notices.allows("all", now_ns)

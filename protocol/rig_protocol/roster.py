@@ -1,7 +1,7 @@
 """Who belongs to the rig: which slot a camera that says hello may have (protocol/SPEC.md, section 6)."""
 
 from collections.abc import Collection
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 from rig_protocol.messages import Hello, Reject, RejectReason
 
@@ -26,6 +26,16 @@ class Roster:
 
     slots: tuple[Slot, ...] = ()
     open: bool = False
+
+    def with_slot(self, slot: Slot) -> "Roster":
+        """The same with this slot in place of the one with its id, and its camera in no other."""
+        others = (
+            replace(one, serial=None) if slot.serial is not None and one.serial == slot.serial else one
+            for one in self.slots
+            if one.camera_id != slot.camera_id
+        )
+        slots = sorted([*others, slot], key=lambda one: one.camera_id)
+        return Roster(tuple(slots), self.open)
 
     def assign(self, hello: Hello, recalled: int | None, taken: Collection[int]) -> int | Reject:
         """The camera id that a hello gets, or why none.

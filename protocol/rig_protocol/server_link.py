@@ -203,6 +203,15 @@ class ServerLink:
         self._push(ControlAnswered(camera_id, ticket, Outcome.REFUSED, refusal))
         return ticket
 
+    @property
+    def roster(self) -> Roster:
+        """Who belongs to the rig; a new one holds for the hellos that come from then on."""
+        return self._reception.roster
+
+    @roster.setter
+    def roster(self, roster: Roster) -> None:
+        self._reception.roster = roster
+
     def dismiss(self, camera_id: int, why: str) -> None:
         """End a camera's session with a goodbye that says why."""
         session = self._sessions.of_camera(camera_id)

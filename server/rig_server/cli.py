@@ -292,6 +292,7 @@ def budget(
 @contextlib.contextmanager
 def _open_rig(settings: "RigSettings", simulate: int | None, seed: int | None) -> Iterator["Rig"]:
     """The rig that the options ask for, not begun yet, and its metrics where settings ask for them."""
+    from rig_server.announcement import announced
     from rig_server.metrics_endpoint import metrics_served
     from rig_server.operator_requests import OperatorRequests
     from rig_server.operator_socket import operator_served
@@ -302,6 +303,7 @@ def _open_rig(settings: "RigSettings", simulate: int | None, seed: int | None) -
         contextlib.closing(rig),
         metrics_served(settings.metrics_address, rig.status),
         operator_served(settings.control_socket, OperatorRequests(rig)),
+        announced(settings.address) if settings.announce and simulate is None else contextlib.nullcontext(),
     ):
         yield rig
 

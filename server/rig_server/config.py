@@ -145,6 +145,8 @@ class RigSettings(Settings):
     control_socket: Path | None = Field(None, examples=[Path("/run/kinect-rig/control.sock")])
     """Where `rig-server control` reaches the running server (docs/control.md); unset: this one where the
     server may write there, else kinect-rig/control.sock in $XDG_RUNTIME_DIR."""
+    announce: bool = True
+    """Whether agents with `server = "auto"` may find this server by mDNS; one on loopback says nothing."""
     log_level: Literal["DEBUG", "INFO", "WARNING", "ERROR"] = "INFO"
     """What is worth a line in the log."""
     synchroniser: SynchroniserSettings = SynchroniserSettings()
@@ -199,7 +201,7 @@ class RigSettings(Settings):
 
 def load_rig_settings(file: Path | None, overrides: Mapping[str, Any] | None = None) -> RigSettings:
     """Settings from `file`, else ./rig.toml, else /etc/kinect-rig/rig.toml, else the defaults."""
-    found = file or next((place for place in CONFIG_PLACES if place.is_file()), None)
+    found = file or settings_file()
     settings = load_settings(RigSettings, found, ENVIRONMENT_PREFIX, overrides)
     if found is None:
         return settings
@@ -209,6 +211,11 @@ def load_rig_settings(file: Path | None, overrides: Mapping[str, Any] | None = N
     if watch.calibration is not None and not _overridden(overrides, "watch", "calibration"):
         watch = watch.model_copy(update={"calibration": found.parent / watch.calibration})
     return settings.model_copy(update={"cameras": tuple(cameras), "watch": watch})
+
+
+def settings_file() -> Path | None:
+    """The settings file that is read where none is named; None where there is none."""
+    return next((place for place in CONFIG_PLACES if place.is_file()), None)
 
 
 def parse_address(text: str) -> Address:

@@ -11,6 +11,7 @@ from rig_server.assembler import SetRecord
 from rig_server.histogram import HistogramSnapshot
 from rig_server.sample_window import SampleWindow
 from rig_server.synchroniser import IncompleteSet
+from rig_server.unassigned import UnassignedAgent
 
 TEMPERATURE = "temperature_c"  # the gauge of an agent's heartbeat that has a column of its own
 _RATE_WINDOW_NS = 3_000_000_000
@@ -74,6 +75,7 @@ class RigStatus:
     place; `unread_bytes`: how much of the kernel's receive buffer is taken. `durations`: histograms since the
     start, by the names in `rig_server.durations`; `recent`: the same of the last half minute. `link`: what is
     sent and what that takes, in words. `drift`: what the drift watch says, None where nobody watches.
+    `unassigned`: agents that hold the key and have no slot.
     """
 
     cameras: tuple[CameraMetrics, ...]
@@ -92,6 +94,7 @@ class RigStatus:
     link: str | None = None
     drift: DriftReport | None = None
     authenticated: bool = False
+    unassigned: tuple[UnassignedAgent, ...] = ()
 
     @property
     def connected(self) -> int:

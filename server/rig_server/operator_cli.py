@@ -1,4 +1,4 @@
-"""Commands of `rig-server` that speak to the running server: control, identify, agents."""
+"""Commands of `rig-server` that speak to the running server: control, identify, agents, assign."""
 
 import json
 import time
@@ -38,12 +38,26 @@ Needs a running rig-server on this machine, and its user or root. docs/control.m
 Exit status: 0 all did it, 1 some did not or no server runs, 2 wrong usage.
 """
 
+_ASSIGN_EXAMPLES = """
+**Examples**
+
+`rig-server agents` — who is here, and who waits for a slot
+
+`rig-server assign pi-7 3` — the Kinect of the waiting agent pi-7 is camera 3 from now on
+
+`rig-server assign A00366A10921051A 3 --offline` — the same by its serial number, with no server running
+
+Writes rig.toml (its comments stay) and tells the running server. docs/control.md explains it.
+Exit status: 0 done, 2 wrong usage or settings.
+"""
+
 
 def add_operator_commands(app: typer.Typer) -> None:
     """Add the commands to the program."""
     app.command(epilog=_CONTROL_EXAMPLES)(control)
     app.command()(identify)
     app.command()(agents)
+    app.command(epilog=_ASSIGN_EXAMPLES)(assign)
 
 
 def control(
@@ -100,7 +114,66 @@ def agents(config: ConfigOption = None, socket: SocketOption = None, as_json: Js
     for one in answer["cameras"]:
         state = f"{one['fps']:.1f} fps" if one["connected"] else "away"
         table.add_row(str(one["camera"]), one["name"], one["serial"] or "–", one["port_path"] or "–", state)
-    Console(highlight=False).print(table)
+    console = Console(highlight=False)
+    console.print(table)
+    for one in answer["unassigned"]:
+        traits = ", ".join(f"{key} {one[key]}" for key in ("serial", "port_path") if one[key])
+        wish = "" if one["camera_id"] is None else f", says it is slot {one['camera_id']}"
+        console.print(
+            f"without a slot: {one['name']} at {one['host']} ({traits or 'no serial number'}{wish}): "
+            f"rig-server assign {one['serial'] or one['name']} SLOT",
+            soft_wrap=True,
+        )
+
+
+def assign(
+    agent: Annotated[str, typer.Argument(help="Name or serial number of a waiting agent, or of a camera.")],
+    slot: Annotated[int, typer.Argument(min=0, max=63, help="Slot in the ring.")],
+    name: Annotated[str | None, typer.Option(help="Name for tables and files; else camNN.")] = None,
+    offline: Annotated[
+        bool, typer.Option("--offline", help="AGENT is a serial number; only write the file.")
+    ] = False,
+    config: ConfigOption = None,
+    socket: SocketOption = None,
+) -> None:
+    """Give a slot to a camera: in rig.toml, and in the running server at once."""
+    from rig_server.config import settings_file
+    from rig_server.operator_socket import ask_server
+    from rig_server.rig_toml import assign_slot
+
+    file = config or settings_file()
+    if file is None:
+        raise ConfigurationError("there is no rig.toml to write the slot into: rig-server init makes one")
+    place = _socket(socket, config)
+    found = {"serial": agent, "port_path": None}
+    if not offline:
+        found = _identity(agent, ask_server(place, {"do": "agents"}))
+    told = assign_slot(file, slot, found["serial"], found["port_path"], name)
+    if not offline:
+        ask_server(place, {"do": "assign", "slot": slot, "name": name, **found})
+    who = f"serial {found['serial']}" if found["serial"] else f"port {found['port_path']}"
+    typer.echo("; ".join([f"{file}: slot {slot} is for {who}", *told]))
+
+
+def _identity(agent: str, known: dict[str, Any]) -> dict[str, str | None]:
+    """By what the server knows a camera again; ConfigurationError: it is not here, or has no such thing."""
+    here = [*known["unassigned"], *known["cameras"]]
+    matching = [one for one in here if agent in (one["name"], one["serial"])]
+    if len({(one["serial"], one.get("host")) for one in matching}) > 1:
+        raise ConfigurationError(f"several agents are called {agent}: give the serial number")
+    if not matching:
+        names = ", ".join(one["serial"] or one["name"] for one in here) or "nobody"
+        raise ConfigurationError(f"no agent {agent} is here, only {names}; --offline takes a serial number")
+    one = matching[0]
+    if one["serial"] and one["serial"].strip("0"):
+        return {"serial": one["serial"], "port_path": None}
+    alike = [other for other in here if other["port_path"] == one["port_path"]]
+    if one["port_path"] and len(alike) == 1:
+        return {"serial": None, "port_path": one["port_path"]}
+    raise ConfigurationError(
+        f"the Kinect of {agent} has no serial number, and others are at the same port of their machine: "
+        "set `camera` to the slot in that machine's agent.toml instead"
+    )
 
 
 def _control(place: Path | None, camera: str, name: str, value: object) -> list[dict[str, Any]]:

@@ -1,10 +1,13 @@
 """What the operator of a running server may ask, and the answers: plain values that JSON can hold."""
 
 from collections.abc import Mapping
+from dataclasses import asdict
 from typing import Any
 
 from rig_protocol.errors import ConfigurationError
 from rig_protocol.messages import ControlValue
+from rig_protocol.roster import Slot
+from rig_server.config import MAX_CAMERAS
 from rig_server.operator_socket import Answer, Request
 from rig_server.rig import Rig
 
@@ -24,6 +27,8 @@ class OperatorRequests:
                 return self._control(request)
             case "agents":
                 return self._agents()
+            case "assign":
+                return self._assign(request)
             case other:
                 raise ConfigurationError(f"this server cannot do {other!r}: its release is another")
 
@@ -41,9 +46,19 @@ class OperatorRequests:
             ]
         }
 
+    def _assign(self, request: Request) -> Answer:
+        slot, name = request.get("slot"), request.get("name")
+        serial, port_path = request.get("serial"), request.get("port_path")
+        texts = [text for text in (name, serial, port_path) if text is not None]
+        if type(slot) is not int or not 0 <= slot < MAX_CAMERAS or not all(isinstance(t, str) for t in texts):
+            raise ConfigurationError(f"a slot is a number from 0 to {MAX_CAMERAS - 1}, all else is text")
+        self._rig.assign(Slot(slot, name or f"cam{slot:02d}", serial, port_path))
+        return {}
+
     def _agents(self) -> Answer:
-        hellos = self._rig.hellos
+        hellos, status = self._rig.hellos, self._rig.status()
         return {
+            "unassigned": [asdict(agent) for agent in status.unassigned],
             "cameras": [
                 {
                     "camera": camera.camera_id,
@@ -53,8 +68,8 @@ class OperatorRequests:
                     "serial": hellos[camera.camera_id].serial if camera.camera_id in hellos else None,
                     "port_path": hellos[camera.camera_id].port_path if camera.camera_id in hellos else None,
                 }
-                for camera in self._rig.status().cameras
-            ]
+                for camera in status.cameras
+            ],
         }
 
     def _names(self) -> dict[int, str]:

@@ -6,6 +6,7 @@ import threading
 import time
 from collections import deque
 from collections.abc import Collection, Mapping
+from dataclasses import replace
 
 from rig_protocol.codecs import COLOR_CODECS, DEPTH_CODECS
 from rig_protocol.errors import RigError
@@ -22,7 +23,7 @@ from rig_protocol.frames import PanoramicFrame, RgbdFrame
 from rig_protocol.messages import ControlValue, Hello
 from rig_protocol.rig_folder import RigDescription
 from rig_protocol.rig_key import RigKey
-from rig_protocol.roster import Roster, Slot
+from rig_protocol.roster import Roster, Slot, known_serial
 from rig_protocol.server_link import ServerLink
 from rig_protocol.system_clock import SystemClock
 from rig_server.assembler import Assembler
@@ -39,6 +40,7 @@ from rig_server.rig_status import StatusReader
 from rig_server.stream_control import StreamControl
 from rig_server.stream_planner import StreamPlanner
 from rig_server.synchroniser import Synchroniser
+from rig_server.unassigned import UnassignedAgents
 
 logger = logging.getLogger(__name__)
 
@@ -97,6 +99,7 @@ class LivePipeline:
         self._connected: set[int] = set()
         self._hellos: dict[int, Hello] = {}
         self._refusals: deque[HelloRefused] = deque(maxlen=_REFUSALS)
+        self._unassigned = UnassignedAgents()
         self._last_join_s = time.monotonic()
 
     @property
@@ -145,7 +148,9 @@ class LivePipeline:
 
     def status(self) -> RigStatus:
         """The rig at this moment; any thread may ask."""
-        return self._status.read(self.hellos)
+        with self._presence:
+            unassigned = self._unassigned.here(rig_time_ns())
+        return replace(self._status.read(self.hellos), unassigned=unassigned)
 
     def control(
         self, cameras: int | Collection[int] | None, name: str, value: ControlValue
@@ -155,6 +160,19 @@ class LivePipeline:
             connected = set(self._connected)
         chosen = connected if cameras is None else {cameras} if isinstance(cameras, int) else cameras
         return self._remote.control(chosen, name, value)
+
+    def assign(self, slot: Slot) -> None:
+        """Give a slot to a camera, until the server ends; another one that holds it is dismissed."""
+        with self._presence:
+            self._unassigned.forget({slot.serial})
+
+        def change(_now_ns: int) -> None:
+            self._link.roster = self._link.roster.with_slot(slot)
+            holder = self._link.cameras.get(slot.camera_id)
+            if holder is not None and slot.serial not in (None, known_serial(holder.hello)):
+                self._link.dismiss(slot.camera_id, f"slot {slot.camera_id} was given to another camera")
+
+        self._receiver.post(change)
 
     def _check_receiver(self) -> None:
         if self._receiver.failure is not None:
@@ -190,6 +208,7 @@ class LivePipeline:
                     # An agent tries on every few seconds; the operator is told once.
                     told = any(one.address[0] == address[0] and one.text == text for one in self._refusals)
                     self._refusals.append(event)
+                    self._unassigned.take(event, rig_time_ns())
                 logger.log(logging.DEBUG if told else logging.WARNING, "refused %s: %s", address[0], text)
 
     def _on_turn(self, now_ns: int) -> None:

@@ -9,6 +9,7 @@ from rig_protocol.events import ControlAnswered
 from rig_protocol.frames import PanoramicFrame
 from rig_protocol.messages import ControlValue, Hello
 from rig_protocol.rig_folder import RigDescription, frame_indices, read_frame, read_rig_description
+from rig_protocol.roster import Slot
 from rig_server.metrics import CameraMetrics, RigStatus
 
 
@@ -77,6 +78,10 @@ class RecordedRig:
     ) -> Mapping[int, ControlAnswered]:
         """A recording cannot be told anything: RigError."""
         raise RigError(f"{self.place} is a recording: nobody is there to set {name}")
+
+    def assign(self, slot: Slot) -> None:
+        """A recording's cameras are what they are: RigError."""
+        raise RigError(f"{self.place} is a recording: slot {slot.camera_id} cannot be given away")
 
     def status(self) -> RigStatus:
         """Cameras and sets read so far; a recording has no rates."""

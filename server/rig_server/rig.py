@@ -18,6 +18,7 @@ from rig_protocol.messages import ControlValue, Hello
 from rig_protocol.poses import Pose
 from rig_protocol.rig_folder import RigDescription
 from rig_protocol.rig_key import RigKey
+from rig_protocol.roster import Slot
 from rig_server.config import MAX_CAMERAS, RigSettings, load_rig_settings, parse_address
 from rig_server.metrics import RigStatus
 from rig_server.pipeline import LivePipeline
@@ -77,6 +78,10 @@ class Feed(Protocol):
         self, cameras: int | Collection[int] | None, name: str, value: ControlValue
     ) -> Mapping[int, ControlAnswered]:
         """Have these agents, or every connected one, do something; the answers by camera id."""
+        ...
+
+    def assign(self, slot: Slot) -> None:
+        """Give a slot to a camera."""
         ...
 
     def status(self) -> RigStatus:
@@ -203,6 +208,10 @@ class Rig:
         be told at all; what an agent refuses is an outcome, no error. RigError for a recording.
         """
         return self._feed.control(cameras, name, value)
+
+    def assign(self, slot: Slot) -> None:
+        """Give a slot to a camera, until the rig ends (`rig-server assign` writes rig.toml, too)."""
+        self._feed.assign(slot)
 
     @property
     def description(self) -> RigDescription:

@@ -33,6 +33,7 @@ def summary(status: RigStatus) -> tuple[list[str], list[str]]:
         "often missing": ", ".join(missing),
         "waiting": _waiting(status),
         "dropped": _counts(status.dropped),
+        "without a slot (rig-server assign)": ", ".join(map(str, status.unassigned)),
         "rejected datagrams": _counts(status.rejected, _MOST_CAUSES),
     }
     return figures, [f"{what}: {which}" for what, which in troubles.items() if which]

@@ -29,6 +29,7 @@ class MemoryTransport:
 
     def __init__(self, _server: object) -> None:
         self.counters = TransportCounters()
+        self.server = "memory:1"
         self.opened = 0
         self.network = True
         self.sent: list[bytes] = []

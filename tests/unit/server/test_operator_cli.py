@@ -10,10 +10,12 @@ import pytest
 from rig_protocol.errors import ConfigurationError
 from rig_server import Rig
 from rig_server.cli import main
-from rig_server.config import RigSettings
+from rig_server.config import RigSettings, load_rig_settings
 from rig_server.control_catalogue import CATALOGUE, parse_value
+from rig_server.operator_cli import _identity
 from rig_server.operator_requests import OperatorRequests
 from rig_server.operator_socket import operator_served
+from rig_server.status_words import summary
 from support.small_agent import SmallAgent
 
 Operator = Callable[..., int]
@@ -124,3 +126,62 @@ def test_values_are_read_as_their_control_means_them(name: str, text: str | None
 def test_values_that_a_control_cannot_have_are_wrong_usage(name: str, text: str | None) -> None:
     with pytest.raises(ConfigurationError, match=name):
         parse_value(name, text)
+
+
+@pytest.fixture
+def listed(tmp_path: Path) -> Iterator[Rig]:
+    """A running rig whose rig.toml lists slot 1 for another camera than the one that comes."""
+    (tmp_path / "rig.toml").write_text(
+        """listen = "127.0.0.1:0"\ninsecure = true\n[[cameras]]\nid = 1 # right\nserial = "OTHER"\n"""
+    )
+    rig = Rig.live(load_rig_settings(tmp_path / "rig.toml"))
+    with rig, operator_served(tmp_path / "control.sock", OperatorRequests(rig)):
+        yield rig
+
+
+def test_an_agent_without_a_slot_is_listed_and_can_be_given_one(
+    listed: Rig, operator: Operator, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    host, port = listed.place.removeprefix("UDP ").split(":")
+    with SmallAgent(1, (host, int(port))):
+        while not listed.status().unassigned:
+            listed.next_panorama(0.05)
+        assert any("S1" in line for line in summary(listed.status())[1])
+        assert operator("agents", "--socket", "control.sock") == 0
+        assert "rig-server assign S1 SLOT" in capsys.readouterr().out
+        assert operator("assign", "pi-1", "1", "--socket", "control.sock") == 0
+        listed.wait_for_cameras(10)  # it is taken without a restart of either side
+        assert listed.hellos[1].serial == "S1"
+        assert not listed.status().unassigned
+    [camera] = load_rig_settings(tmp_path / "rig.toml").cameras
+    assert (camera.id, camera.serial) == (1, "S1")
+    assert "# right" in (tmp_path / "rig.toml").read_text()
+
+
+@pytest.mark.usefixtures("listed")
+def test_an_agent_that_is_not_here_is_assigned_only_by_its_serial_number_offline(
+    operator: Operator, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    before = (tmp_path / "rig.toml").read_text()
+    assert operator("assign", "S7", "3", "--socket", "control.sock") == 2
+    assert "--offline" in capsys.readouterr().err
+    assert (tmp_path / "rig.toml").read_text() == before
+    assert operator("assign", "S7", "3", "--offline") == 0
+    assert [camera.id for camera in load_rig_settings(tmp_path / "rig.toml").cameras] == [1, 3]
+
+
+@pytest.mark.parametrize(
+    ("serial", "port_path", "other_port"), [(None, None, "1-1"), ("0000000000", "1-1", "1-1")]
+)
+def test_a_kinect_that_nothing_identifies_needs_its_slot_in_its_own_settings(
+    serial: str | None, port_path: str | None, other_port: str
+) -> None:
+    agent = {"name": "pi-1", "host": "a", "serial": serial, "port_path": port_path, "camera_id": None}
+    other = {"name": "pi-2", "host": "b", "serial": serial, "port_path": other_port, "camera_id": None}
+    with pytest.raises(ConfigurationError, match=r"agent\.toml"):
+        _identity("pi-1", {"unassigned": [agent, other], "cameras": []})
+
+
+def test_a_kinect_without_a_serial_number_is_known_by_a_port_that_nobody_shares() -> None:
+    agent = {"name": "pi-1", "host": "a", "serial": None, "port_path": "1-1.3", "camera_id": None}
+    assert _identity("pi-1", {"unassigned": [agent], "cameras": []}) == {"serial": None, "port_path": "1-1.3"}
