@@ -17,6 +17,8 @@ _EXAMPLES = """
 
 `rig-agent --server 10.0.0.1` — a Kinect on this Pi, to a server there
 
+`rig-agent --source openni2 --recording office.oni --camera 2` — play an OpenNI2 recording
+
 `rig-agent --source folder --path recordings/office --camera 3` — play camera 3 of a rig folder
 
 `rig-agent --source synthetic --camera 0 --seed 7` — one camera of the simulated ring
@@ -44,7 +46,8 @@ def run(
     source: Annotated[
         str | None,
         typer.Option(
-            metavar="NAME", help="freenect (a Kinect), folder (a recording) or synthetic (simulated)."
+            metavar="NAME",
+            help="freenect (a Kinect), openni2 (another camera), folder (recorded), synthetic (simulated).",
         ),
     ] = None,
     server: Annotated[
@@ -55,6 +58,9 @@ def run(
         typer.Option(metavar="ID", help="Slot in the ring; with a folder, an id or name of nominal.json."),
     ] = None,
     path: Annotated[Path | None, typer.Option(help="The rig folder to play (source folder).")] = None,
+    recording: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="The .oni recording to play (source openni2).")
+    ] = None,
     fps: Annotated[float | None, typer.Option(help="Frames a second.")] = None,
     seed: Annotated[int | None, typer.Option(help="Seed of the simulated rig (source synthetic).")] = None,
     cameras: Annotated[
@@ -92,14 +98,18 @@ def run(
         "fps": fps,
         "key_file": key_file,
         "insecure": insecure or None,
+        "openni2": {"recording": recording},
         "folder": {"path": path, "camera": name},
         "synthetic": {"seed": seed, "cameras": cameras},
     }
     settings = load_agent_settings(config, overrides)
     _refuse_options_of_another_source(
         settings.source,
-        {"--path": path, "--camera NAME": name},
-        {"--seed": seed, "--cameras": cameras, "--truth-out": truth_out},
+        {
+            "openni2": {"--recording": recording},
+            "folder": {"--path": path, "--camera NAME": name},
+            "synthetic": {"--seed": seed, "--cameras": cameras, "--truth-out": truth_out},
+        },
     )
     if print_config:
         typer.echo(effective_toml(settings), nl=False)
@@ -167,9 +177,9 @@ def _slot_or_name(camera: str | None) -> tuple[int | None, str | None]:
     return None, camera
 
 
-def _refuse_options_of_another_source(source: str, folder: dict[str, Any], synthetic: dict[str, Any]) -> None:
+def _refuse_options_of_another_source(source: str, owned: dict[str, dict[str, Any]]) -> None:
     """ConfigurationError for an option that the chosen source would silently ignore."""
-    for owner, options in (("folder", folder), ("synthetic", synthetic)):
+    for owner, options in owned.items():
         for option, value in options.items():
             if value is not None and source != owner:
                 raise ConfigurationError(f"{option} belongs to --source {owner}, but the source is {source}")
