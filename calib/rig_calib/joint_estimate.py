@@ -18,6 +18,7 @@ from rig_calib.refinement import RefinedRig, refine
 from rig_calib.registration import ransac
 from rig_calib.rig_adjustment import AT_REST, AdjustedRig, adjust_rig
 from rig_calib.settings import CalibrationSettings
+from rig_calib.shared_planes import find_shared_planes
 from rig_calib.uncertainty import weakest_direction
 from rig_protocol.poses import Pose, inverse, rotation_angle_deg
 from rig_protocol.rig_folder import RingDrawing
@@ -68,7 +69,7 @@ def estimate_jointly(
     keypoint_matches = {edge.pair: edge.agreeing_matches for edge in edges if edge.reason is None}
     rig = adjust_rig(cameras, keypoint_matches, start, ring, settings)
     far = {pair for pair, px in _prediction_px(rig, regions).items() if px > _FAR_AND_WIDE_PX}
-    noise = AT_REST
+    noise, shared = AT_REST, None
     for k in range(_MAX_ROUNDS):
         before, prediction_px = rig.poses, _prediction_px(rig, regions)
         depth_only = far if k < _DEPTH_ROUNDS else set()
@@ -78,13 +79,15 @@ def estimate_jointly(
         matches = _verified(refined, far - depth_only, prediction_px, settings)
         graduated = bool(far) and k < len(_GRADUATED_NOISE)
         assumed = _GRADUATED_NOISE[k] if graduated else noise
-        rig = adjust_rig(refined.cameras, matches, before, ring, settings, assumed)
+        if shared is None and not graduated:
+            shared = find_shared_planes(cameras, rig.scene.cameras, rig.adjustment)
+        rig = adjust_rig(refined.cameras, matches, before, ring, settings, assumed, shared)
         if not graduated:
             noise = rig.observed_noise()
             if _largest_shift_px(before, rig.poses, regions) < _SETTLED_PX:
                 break
     if noise.differs_from(rig.noise):
-        rig = adjust_rig(refined.cameras, matches, rig.poses, ring, settings, noise)
+        rig = adjust_rig(refined.cameras, matches, rig.poses, ring, settings, noise, shared)
     judged = tuple(_refined_edge(edge, refined, matches, rig, settings) for edge in edges)
     return JointEstimate(rig, refined.cameras, judged)
 

@@ -14,6 +14,7 @@ from rig_calib.observation_model import GRID_INTRINSIC_TERMS, GRID_POSE_TERMS, C
 from rig_calib.observed_camera import ObservedCamera
 from rig_calib.projection import from_pixels
 from rig_calib.settings import CalibrationSettings
+from rig_calib.shared_planes import SharedPlanes
 from rig_calib.tracks import Scene, build_scene, build_tracks
 from rig_calib.uncertainty import PoseCovariance, pose_covariance
 from rig_calib.view import CameraView
@@ -110,6 +111,7 @@ def adjust_rig(
     ring: RingDrawing | None,
     settings: CalibrationSettings,
     noise: NoiseModel = AT_REST,
+    shared: SharedPlanes | None = None,
 ) -> AdjustedRig:
     """Adjust the cameras that have a start in `poses` from matches that are believed.
 
@@ -125,7 +127,13 @@ def adjust_rig(
         )
         for c in scene.cameras
     ]
-    result = adjust(adjusted, scene.points, scene.observations)
+    result = adjust(
+        adjusted,
+        scene.points,
+        scene.observations,
+        None if shared is None else shared.planes,
+        None if shared is None else shared.seen,
+    )
     states = dict(zip(scene.cameras, result.states, strict=True))
     return AdjustedRig(
         poses={c: state.T_rig_camera for c, state in states.items()},
