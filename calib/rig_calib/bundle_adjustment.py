@@ -39,8 +39,10 @@ _CAUCHY_SQUARED = 2.385**2
 _LEAST_CURVATURE = 0.2  # beyond the kernel's bend its curvature is negative
 _NEAR = 0.003  # relative decrease of the cost to be expected
 _MAX_ITERATIONS = 40
-_CONVERGED = 1e-3  # the decrease expected; one standard deviation costs a half
+CONVERGED, ROUGHLY_CONVERGED = 0.005, 0.1
+"""What another step is expected to bring of the cost: one standard deviation of a state is worth a half."""
 _FIRST_DAMPING, _LEAST_DAMPING, _MAX_DAMPING = 1e-6, 1e-12, 1e8
+_RAISED_DAMPING = 0.1  # at least, after a step that led uphill: less changes nothing
 _LEAST_INFORMATION = 1e-12
 # From here on, 40 cameras or so, a ring is solved faster as a sparse system.
 _MANY_STATES = 1000
@@ -102,6 +104,7 @@ def adjust(
     seen: Observations,
     planes: Array | None = None,
     seen_planes: PlaneObservations | None = None,
+    converged: float = CONVERGED,
 ) -> Adjustment:
     """Minimise the robust cost from the cameras' start states, `points` (P,3) and `planes` (K,3), rig frame.
 
@@ -113,7 +116,7 @@ def adjust(
     problem = _Problem.of(cameras, LandmarkCounts(len(points), len(planes)), seen, seen_planes)
     here = problem.evaluate(_start(cameras, points, planes))
     damping, gain, iterations = _FIRST_DAMPING, np.inf, 0
-    while gain > _CONVERGED and iterations < _MAX_ITERATIONS:
+    while gain > converged and iterations < _MAX_ITERATIONS:
         iterations += 1
         here, damping, gain = _descend(problem, here, damping, near=gain < _NEAR * here.cost)
     return _result(problem, here, iterations)
@@ -217,9 +220,9 @@ def _descend(
         gain = 0.5 * float((system.landmarks.pull**2).sum() - steps.ravel() @ system.gradient)
         if there.cost <= here.cost:
             return there, max(damping * 0.1, _LEAST_DAMPING), gain
-        if gain <= _CONVERGED:
+        if gain <= CONVERGED:
             break
-        damping *= 10.0
+        damping = max(damping * 10.0, _RAISED_DAMPING)
     return here, damping, 0.0
 
 

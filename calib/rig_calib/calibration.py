@@ -4,9 +4,7 @@ Keypoints on the overlaps, matches, 3D points, relative poses of pairs (sections
 closed over the loop (II-B). The method `joint` puts one adjustment of everything in place of the last.
 """
 
-import os
 from collections.abc import Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 import numpy as np
@@ -20,7 +18,8 @@ from rig_calib.joint_estimate import estimate_jointly
 from rig_calib.loops import closing_cycle
 from rig_calib.matching import Matches, flann_matches, mutual_matches
 from rig_calib.observed_camera import ObservedCamera, missing_images, observe
-from rig_calib.overlap import Region, shared_regions
+from rig_calib.overlap import Region, joined, shared_regions
+from rig_calib.parallel import in_threads
 from rig_calib.pose_graph import chain_poses, loop_error, optimise, spanning_tree
 from rig_calib.rig_adjustment import AdjustedRig
 from rig_calib.rig_calibration import CalibratedCamera, CalibratedEdge, LoopClosure, RigCalibration
@@ -80,14 +79,15 @@ def calibrate(
 
     # Matching: keypoints that look alike
     with stages.stage("matching"):
-        matches = {pair: _match(cameras, pair, regions[pair], settings) for pair in regions}
+        found = in_threads(lambda pair: _match(cameras, pair, regions[pair], settings), regions)
+        matches = dict(zip(regions, found, strict=True))
 
     # Registration: each pair alone (eq. 4, 5), then all pairs against each other
     with stages.stage("registration"):
         edges = []
-        for k, ((i, j), rows) in enumerate(matches.items()):
-            edges.append(measure_edge(cameras[i], cameras[j], rows, settings))
-            stages.tell(k / len(matches))
+        for edge in in_threads(lambda pair: _measure(cameras, pair, matches[pair], settings), matches):
+            edges.append(edge)
+            stages.tell(len(edges) / len(matches))
         graph = consistent_graph(edges, list(cameras), nominal, settings.seed)
 
     # Optimisation: pose graph (eq. 6) or joint adjustment
@@ -132,17 +132,16 @@ def _observe_all(
     stages: Stages,
 ) -> dict[int, ObservedCamera]:
     """Cameras that may share a view, observed where they may."""
-    wanted: dict[int, Region] = {}
+    wanted: dict[int, list[Region]] = {}
     for pair, sides in regions.items():
         for camera_id, region in zip(pair, sides, strict=True):
-            wanted[camera_id] = region.union(wanted.get(camera_id, region))
+            wanted.setdefault(camera_id, []).append(region)
     sharing = [view for view in views if view.camera_id in wanted]
     cameras = {}
-    with ThreadPoolExecutor(os.cpu_count()) as pool:  # detectors run without the interpreter's lock
-        observed = pool.map(lambda v: observe(v, wanted[v.camera_id], settings), sharing)
-        for view, camera in zip(sharing, observed, strict=True):
-            cameras[view.camera_id] = camera
-            stages.tell(len(cameras) / len(sharing))
+    observed = in_threads(lambda view: observe(view, joined(wanted[view.camera_id]), settings), sharing)
+    for view, camera in zip(sharing, observed, strict=True):
+        cameras[view.camera_id] = camera
+        stages.tell(len(cameras) / len(sharing))
     return cameras
 
 
@@ -156,6 +155,12 @@ def _match(
     if settings.method == "paper":
         return flann_matches(a, b, regions, settings.match_distance_multiple, settings.seed)
     return mutual_matches(a, b, regions, settings.match_ratio, settings.match_max_distance)
+
+
+def _measure(
+    cameras: Mapping[int, ObservedCamera], pair: Pair, matches: Matches, settings: CalibrationSettings
+) -> Edge:
+    return measure_edge(cameras[pair[0]], cameras[pair[1]], matches, settings)
 
 
 def _solve_pose_graph(

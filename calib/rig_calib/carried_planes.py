@@ -61,7 +61,8 @@ def carry(
         [side.view.model.color for side in sides], [side.grid for side in sides], len(states[0].bias)
     )
     estimate = models.with_states(
-        np.array([state.T_rig_camera for state in states]), np.array([state.beside_pose() for state in states])
+        np.array([state.T_rig_camera for state in states]),
+        np.array([state.beside_pose() for state in states]),
     )
     known, first = models.plane_rows(seen), np.searchsorted(seen.plane, np.arange(count))
     camera, planes = seen.camera[first], starts
@@ -74,7 +75,7 @@ def carry(
         pull = np.add.reduceat(by_plane * residual[:, None], first)
         planes = planes - (own @ pull[..., None])[..., 0]
     follows = -own @ np.add.reduceat(by_plane[:, :, None] * by_state[:, None], first)
-    covariance = _of_states(follows, camera, adjustment.normal)
+    covariance = _of_states(np.asarray(follows, dtype=np.float64), camera, adjustment.normal)
     covariance[np.arange(count), :, np.arange(count)] += own
     return CarriedPlanes(camera, planes, covariance)
 
@@ -87,4 +88,3 @@ def _of_states(follows: Array, camera: Index, normal: Array) -> Array:
     flat = by_all.reshape(3 * count, -1) * (np.diag(normal) > 0.0)  # what is held does not err
     spread = np.linalg.solve(normal + _VAGUE_INFORMATION * np.eye(len(normal)), flat.T)
     return np.asarray(flat @ spread).reshape(count, 3, count, 3)
-

@@ -43,8 +43,8 @@ _REFITS = 6
 class DepthPlane:
     """M cells of a camera's depth that lie on one plane: `disparity` (M,) at `grid_pixels` (M,2).
 
-    `normal` (3,) is the plane π of the corrected depth in the depth camera's frame, `points_m` (M,3) are where
-    the cells' rays meet it, and `misfit` (M,) is what it and its bend leave of the cells, raw steps.
+    `normal` (3,) is the plane π of the corrected depth in the depth camera's frame, `points_m` (M,3) is where
+    the cells' rays meet it; `misfit` (M,) is what it and its bend leave of the cells, raw steps.
     """
 
     grid_pixels: Array
@@ -200,4 +200,4 @@ def _blocks(number: Index) -> Index:
         return np.empty((0, _BLOCK**2), dtype=np.intp)
     windows = np.lib.stride_tricks.sliding_window_view(number, (_BLOCK, _BLOCK))[::2, ::2]
     rows = windows.reshape(-1, _BLOCK**2)
-    return rows[(rows >= 0).mean(axis=1) >= _MIN_FILLED_BLOCK]
+    return np.asarray(rows[(rows >= 0).mean(axis=1) >= _MIN_FILLED_BLOCK])

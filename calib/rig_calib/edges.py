@@ -1,11 +1,15 @@
 """Edges: what one pair of cameras says of its relative pose, and whether that fixes all six degrees."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from types import MappingProxyType
 
 import numpy as np
 import numpy.typing as npt
 
+from rig_calib.bundle_adjustment import ROUGHLY_CONVERGED
 from rig_calib.matching import Matches
+from rig_calib.observation_model import CameraState
 from rig_calib.observed_camera import ObservedCamera
 from rig_calib.registration import Tolerance, agreeing, minimise_distances, ransac
 from rig_calib.rig_adjustment import adjust_rig
@@ -66,9 +70,17 @@ def measure_edge(
 
 
 def estimate_edge(
-    i: ObservedCamera, j: ObservedCamera, matches: Matches, start: Pose, settings: CalibrationSettings
+    i: ObservedCamera,
+    j: ObservedCamera,
+    matches: Matches,
+    start: Pose,
+    settings: CalibrationSettings,
+    states: Mapping[int, CameraState] = MappingProxyType({}),
 ) -> Edge:
-    """The method's estimate of T_i_j from a start, and the test of its support."""
+    """The method's estimate of T_i_j from a start, and the test of its support.
+
+    `states` are what else is known of the two cameras, to start from.
+    """
     ids = (i.view.camera_id, j.view.camera_id)
     inlier = agreeing(start, i.side(matches[:, 0]), j.side(matches[:, 1]), TOLERANCE)
     both = i.depth.known[matches[:, 0]] & j.depth.known[matches[:, 1]] & inlier
@@ -78,8 +90,15 @@ def estimate_edge(
     if settings.method == "paper":
         T_i_j, covariance = _paper_estimate(p_i, p_j, start)
     else:
+        poses = {ids[0]: np.eye(4), ids[1]: start}
         pair = adjust_rig(
-            {ids[0]: i, ids[1]: j}, {ids: matches[inlier]}, {ids[0]: np.eye(4), ids[1]: start}, None, settings
+            {ids[0]: i, ids[1]: j},
+            {ids: matches[inlier]},
+            poses,
+            None,
+            settings,
+            states=states,
+            converged=ROUGHLY_CONVERGED,
         )
         T_i_j, covariance = pair.relative(*ids)
     squared_m = ((p_i - transform_points(T_i_j, p_j)) ** 2).sum(axis=1)

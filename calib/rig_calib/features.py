@@ -14,7 +14,8 @@ Array = npt.NDArray[np.float64]
 
 _BORDER_PX = 24  # SIFT looks at a neighbourhood; a cropped region brings it along
 _SAME_PLACE_PX = 0.01
-_COARSE_SHARE = 3  # half the size holds fewer keypoints, and patches need but a start
+_TILE_PX, _LEAST_OF_TILE = 160, 60  # so many of the strongest keypoints come from every tile at least
+_COARSE_SHARE = 6  # half the size holds fewer keypoints, and patches need but a start
 # A blob is placed to a share of its size (0.05 on two renderers' images, where nothing else is wrong).
 _POSITION_SHARE_OF_SCALE = 0.05
 
@@ -49,14 +50,17 @@ def mean_grey(images: Sequence[ImageU8]) -> ImageU8:
     return np.rint(np.mean(np.stack(grey), axis=0, dtype=np.float64)).astype(np.uint8)
 
 
-def detect_coarsely(image: ImageU8, region: Region, max_keypoints: int, pixel_sigma: float) -> Keypoints:
-    """A third of the keypoints, found at half the image's size in a third of the time.
+def detect_coarsely(
+    image: ImageU8, regions: Sequence[Region], max_keypoints: int, pixel_sigma: float
+) -> Keypoints:
+    """A share of the keypoints, spread over the regions, found at half the image's size: a quick start.
 
-    The pixels are those of the whole image.
+    The regions are apart. The pixels are those of the whole image.
     """
     half = np.asarray(cv2.resize(image, None, fx=0.5, fy=0.5, interpolation=cv2.INTER_AREA), dtype=np.uint8)
-    part = Region(region.left // 2, region.top // 2, (region.right + 1) // 2, (region.bottom + 1) // 2)
-    found = detect(half, part, max_keypoints // _COARSE_SHARE, pixel_sigma)
+    parts = [part for region in regions for part in _halved(region).tiles(_TILE_PX)]
+    each = max(max_keypoints // _COARSE_SHARE // max(len(parts), 1), _LEAST_OF_TILE)
+    found = _joined([detect(half, part, each, pixel_sigma) for part in parts])
     # The centre of a pixel of half the size lies between four.
     return replace(found, pixels=2.0 * found.pixels + 0.5, information=0.25 * found.information)
 
@@ -84,6 +88,23 @@ def detect(image: ImageU8, region: Region, max_keypoints: int, pixel_sigma: floa
     variance = pixel_sigma**2 + (_POSITION_SHARE_OF_SCALE * scale_px[order]) ** 2
     information = np.eye(2) / variance[:, None, None]
     return Keypoints(pixels, information, descriptors[order].astype(np.float32), _places(pixels))
+
+
+def _halved(region: Region) -> Region:
+    return Region(region.left // 2, region.top // 2, (region.right + 1) // 2, (region.bottom + 1) // 2)
+
+
+def _joined(parts: Sequence[Keypoints]) -> Keypoints:
+    """The keypoints of several parts of an image, no place of which is in two."""
+    if not parts:
+        return _no_keypoints()
+    first = np.cumsum([0] + [int(part.place.max(initial=-1)) + 1 for part in parts])
+    return Keypoints(
+        np.concatenate([part.pixels for part in parts]),
+        np.concatenate([part.information for part in parts]),
+        np.concatenate([part.descriptors for part in parts]),
+        np.concatenate([part.place + start for part, start in zip(parts, first, strict=False)]),
+    )
 
 
 def _places(pixels: Array) -> npt.NDArray[np.intp]:

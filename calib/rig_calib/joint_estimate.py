@@ -1,6 +1,7 @@
 """The joint estimate: poses, points and what is wrong with every camera in one adjustment, on patches.
 
-Keypoints start it. Then patches are looked for where the poses predict them, and again while the poses move.
+Keypoints start it. Then patches are looked for where the poses predict them, and again while the poses move;
+walls and floor that cameras share join them as soon as the noise is taken for what it is.
 Pairs that only the drawing predicts are led by depth first, with noise that goes down to what it is.
 """
 
@@ -9,16 +10,18 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from rig_calib.bundle_adjustment import ROUGHLY_CONVERGED
 from rig_calib.edges import TOLERANCE, Edge, estimate_edge
 from rig_calib.matching import Matches
 from rig_calib.noise import NoiseModel
 from rig_calib.observed_camera import ObservedCamera
 from rig_calib.overlap import Region
+from rig_calib.parallel import in_threads
 from rig_calib.refinement import RefinedRig, refine
 from rig_calib.registration import ransac
 from rig_calib.rig_adjustment import AT_REST, AdjustedRig, adjust_rig
 from rig_calib.settings import CalibrationSettings
-from rig_calib.shared_planes import find_shared_planes
+from rig_calib.shared_planes import NOTHING_SHARED, find_shared_planes
 from rig_calib.uncertainty import weakest_direction
 from rig_protocol.poses import Pose, inverse, rotation_angle_deg
 from rig_protocol.rig_folder import RingDrawing
@@ -28,7 +31,7 @@ Pair = tuple[int, int]
 # Rough, to judge how far a prediction may be off.
 _FOCAL_PX, _NEAR_WALL_M = 525.0, 1.5
 # Patches are looked for again while poses move by more than a patch's alignment makes up for.
-_MAX_ROUNDS, _SETTLED_PX = 9, 3.0
+_MAX_ROUNDS, _SETTLED_PX = 9, 6.0
 _DEPTH_ROUNDS = 4  # of pairs that nothing but the drawing predicts
 # What is far off must not count as an outlier at once: noise goes down to what it is.
 _GRADUATED_NOISE = tuple(
@@ -67,9 +70,9 @@ def estimate_jointly(
     if len(start) < 2:
         return None
     keypoint_matches = {edge.pair: edge.agreeing_matches for edge in edges if edge.reason is None}
-    rig = adjust_rig(cameras, keypoint_matches, start, ring, settings)
+    rig = adjust_rig(cameras, keypoint_matches, start, ring, settings, converged=ROUGHLY_CONVERGED)
     far = {pair for pair, px in _prediction_px(rig, regions).items() if px > _FAR_AND_WIDE_PX}
-    noise, shared = AT_REST, None
+    noise, shared = AT_REST, NOTHING_SHARED
     for k in range(_MAX_ROUNDS):
         before, prediction_px = rig.poses, _prediction_px(rig, regions)
         depth_only = far if k < _DEPTH_ROUNDS else set()
@@ -79,17 +82,17 @@ def estimate_jointly(
         matches = _verified(refined, far - depth_only, prediction_px, settings)
         graduated = bool(far) and k < len(_GRADUATED_NOISE)
         assumed = _GRADUATED_NOISE[k] if graduated else noise
-        if shared is None and not graduated:
+        if shared is NOTHING_SHARED and not graduated:
             shared = find_shared_planes(cameras, rig.scene.cameras, rig.adjustment)
-        rig = adjust_rig(refined.cameras, matches, before, ring, settings, assumed, shared)
+        rig = adjust_rig(refined.cameras, matches, before, ring, settings, assumed, rig.states, shared)
         if not graduated:
             noise = rig.observed_noise()
             if _largest_shift_px(before, rig.poses, regions) < _SETTLED_PX:
                 break
     if noise.differs_from(rig.noise):
-        rig = adjust_rig(refined.cameras, matches, rig.poses, ring, settings, noise, shared)
-    judged = tuple(_refined_edge(edge, refined, matches, rig, settings) for edge in edges)
-    return JointEstimate(rig, refined.cameras, judged)
+        rig = adjust_rig(refined.cameras, matches, rig.poses, ring, settings, noise, rig.states, shared)
+    judged = in_threads(lambda edge: _refined_edge(edge, refined, matches, rig, settings), edges)
+    return JointEstimate(rig, refined.cameras, tuple(judged))
 
 
 def _drawn(cameras: Mapping[int, ObservedCamera]) -> dict[int, Pose]:
@@ -146,7 +149,7 @@ def _refined_edge(
         reason = edge.reason or "nothing that both cameras recognise was left when depth was corrected"
         return replace(edge, matches=_NO_MATCHES, inlier=np.zeros(0, dtype=bool), reason=reason)
     T_i_j = inverse(rig.poses[i]) @ rig.poses[j]
-    return estimate_edge(refined.cameras[i], refined.cameras[j], rows, T_i_j, settings)
+    return estimate_edge(refined.cameras[i], refined.cameras[j], rows, T_i_j, settings, rig.states)
 
 
 def _prediction_px(rig: AdjustedRig, pairs: Iterable[Pair]) -> dict[Pair, float]:

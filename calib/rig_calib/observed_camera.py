@@ -1,6 +1,8 @@
 """ObservedCamera: a camera's keypoints with their depth, all that the later stages need of its images."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import reduce
 
 import numpy as np
 import numpy.typing as npt
@@ -58,8 +60,8 @@ def missing_images(view: CameraView) -> str | None:
     return None if view.color else "no colour image"
 
 
-def observe(view: CameraView, region: Region, settings: CalibrationSettings) -> ObservedCamera:
-    """Detect keypoints in a region and look up their depth; all frames of the view are averaged.
+def observe(view: CameraView, regions: Sequence[Region], settings: CalibrationSettings) -> ObservedCamera:
+    """Detect keypoints in regions and look up their depth; all frames of the view are averaged.
 
     DataError when the depth images do not fit the camera model.
     """
@@ -68,8 +70,11 @@ def observe(view: CameraView, region: Region, settings: CalibrationSettings) -> 
     images = [disparity_image(view, frame) for frame in range(frames)]
     disparity = mean_disparity(images or [_no_disparity(grid)])
     grey = mean_grey(view.color)
-    find = detect if settings.method == "paper" else detect_coarsely
-    keypoints = find(grey, region, settings.max_keypoints, settings.pixel_sigma)
+    if settings.method == "paper":
+        whole = reduce(Region.union, regions)
+        keypoints = detect(grey, whole, settings.max_keypoints, settings.pixel_sigma)
+    else:
+        keypoints = detect_coarsely(grey, regions, settings.max_keypoints, settings.pixel_sigma)
     depth = keypoint_depth(view.model.color, grid, disparity, keypoints.pixels, max(frames, 1))
     points = keypoint_points(view.model.color, grid, keypoints.pixels, depth)
     return ObservedCamera(view, grid, smoothed(grey), disparity, keypoints, depth, points)

@@ -3,19 +3,24 @@
 Nothing here assumes which image axis is vertical: the poses say it.
 """
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
-from itertools import combinations
+from functools import lru_cache, reduce
+from itertools import combinations, pairwise
 
 import numpy as np
 import numpy.typing as npt
 
-from rig_calib.projection import inside, project, undistort_pixels
+from rig_calib.projection import undistort_pixels
 from rig_protocol.camera import Intrinsics
-from rig_protocol.poses import Pose, inverse, transform_points
+from rig_protocol.compiled import compiled
+from rig_protocol.poses import Pose, inverse
+
+Array = npt.NDArray[np.float64]
 
 _GRID_STEP_PX = 16
 _DEPTHS_M = (0.5, 1.0, 2.0, 5.0)  # the sensor's range; in between the overlap changes smoothly
+_LEAST_AHEAD = 0.1  # of the depth: a pinhole's image ends at right angles to its axis
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,6 +45,34 @@ class Region:
             max(self.right, other.right),
             max(self.bottom, other.bottom),
         )
+
+    def meets(self, other: "Region") -> bool:
+        """Whether the two share a pixel."""
+        across = self.left < other.right and other.left < self.right
+        return across and self.top < other.bottom and other.top < self.bottom
+
+    def tiles(self, side_px: int) -> list["Region"]:
+        """The region cut into equal parts, about as wide and high as said."""
+        columns, rows = (
+            np.linspace(low, high, max(round((high - low) / side_px), 1) + 1).round().astype(int).tolist()
+            for low, high in ((self.left, self.right), (self.top, self.bottom))
+        )
+        return [
+            Region(left, top, right, bottom)
+            for top, bottom in pairwise(rows)
+            for left, right in pairwise(columns)
+        ]
+
+
+def joined(regions: Iterable[Region]) -> list[Region]:
+    """Regions that are apart and hold all of the given ones."""
+    apart: list[Region] = []
+    for region in regions:
+        met = [other for other in apart if other.meets(region)]
+        whole = reduce(Region.union, met, region)
+        apart = [other for other in apart if other not in met]
+        apart = joined([*apart, whole]) if met else [*apart, whole]
+    return apart
 
 
 def whole_image(intrinsics: Intrinsics) -> Region:
@@ -70,28 +103,38 @@ def shared_regions(
 
 def _seen_region(of: Intrinsics, by: Intrinsics, T_by_of: Pose, margin_deg: float) -> Region | None:
     """The part of image `of` that camera `by` sees at any depth of the sensor's range."""
+    pixels, rays = _grid(of)
+    # Without distortion, whose polynomial folds back far outside the image.
+    pinhole = np.array([by.fx, by.fy, by.cx, by.cy])
     margin_px = np.deg2rad(margin_deg) * by.fx
-    pixels = _grid(of)
-    rays = np.column_stack([undistort_pixels(of, pixels), np.ones(len(pixels))])
-    seen = np.zeros(len(pixels), dtype=bool)
-    for depth_m in _DEPTHS_M:
-        points = transform_points(T_by_of, rays * depth_m)
-        ahead = points[:, 2] > 0.1 * depth_m
-        seen[ahead] |= inside(by, project(_undistorted(by), points[ahead]), margin_px)
+    low = np.array([-0.5 - margin_px, -0.5 - margin_px])
+    seen = _seen(rays, T_by_of, pinhole, low, np.array([by.width, by.height]) - 1.0 - low)
     if not seen.any():
         return None
-    low, high = pixels[seen].min(axis=0), pixels[seen].max(axis=0) + 1
-    return Region(int(low[0]), int(low[1]), int(high[0]), int(high[1]))
+    first, last = pixels[seen].min(axis=0), pixels[seen].max(axis=0) + 1
+    return Region(int(first[0]), int(first[1]), int(last[0]), int(last[1]))
 
 
-def _grid(intrinsics: Intrinsics) -> npt.NDArray[np.float64]:
+@compiled()
+def _seen(rays: Array, T_by_of: Pose, pinhole: Array, low: Array, high: Array) -> npt.NDArray[np.bool_]:
+    """Which rays (N,3) a pinhole (fx, fy, cx, cy) sees at any depth, between the pixels `low` and `high`."""
+    seen = np.zeros(len(rays), dtype=np.bool_)
+    for n in range(len(rays)):
+        for depth_m in _DEPTHS_M:
+            x, y, z = rays[n, 0] * depth_m, rays[n, 1] * depth_m, rays[n, 2] * depth_m
+            X = T_by_of[0, 0] * x + T_by_of[0, 1] * y + T_by_of[0, 2] * z + T_by_of[0, 3]
+            Y = T_by_of[1, 0] * x + T_by_of[1, 1] * y + T_by_of[1, 2] * z + T_by_of[1, 3]
+            Z = T_by_of[2, 0] * x + T_by_of[2, 1] * y + T_by_of[2, 2] * z + T_by_of[2, 3]
+            if Z / depth_m > _LEAST_AHEAD:
+                u, v = pinhole[0] * X / Z + pinhole[2], pinhole[1] * Y / Z + pinhole[3]
+                seen[n] |= low[0] <= u <= high[0] and low[1] <= v <= high[1]
+    return seen
+
+
+@lru_cache(maxsize=64)
+def _grid(intrinsics: Intrinsics) -> tuple[Array, Array]:
+    """Pixels (N,2) all over an image, its borders included, and their rays (N,3)."""
     columns = np.append(np.arange(0, intrinsics.width - 1, _GRID_STEP_PX), intrinsics.width - 1)
     rows = np.append(np.arange(0, intrinsics.height - 1, _GRID_STEP_PX), intrinsics.height - 1)
-    return np.stack(np.meshgrid(columns, rows), axis=-1).reshape(-1, 2).astype(np.float64)
-
-
-def _undistorted(intrinsics: Intrinsics) -> Intrinsics:
-    """Without distortion, whose polynomial folds back far outside the image."""
-    return Intrinsics(
-        intrinsics.fx, intrinsics.fy, intrinsics.cx, intrinsics.cy, intrinsics.width, intrinsics.height
-    )
+    pixels = np.stack(np.meshgrid(columns, rows), axis=-1).reshape(-1, 2).astype(np.float64)
+    return pixels, np.column_stack([undistort_pixels(intrinsics, pixels), np.ones(len(pixels))])

@@ -15,6 +15,9 @@ from rig_protocol.compiled import compiled, inlined
 
 Array = npt.NDArray[np.float64]
 ImageF32 = npt.NDArray[np.float32]
+Map = tuple[float, float, float, float]
+"""A (2,2), row by row: steps in the source to steps in the target."""
+Moments = tuple[float, float, float, float, float, float, float, float]
 
 RADIUS_PX = 7
 _BLUR_PX = 0.8  # so that bilinear interpolation is exact enough, and the noise of the mosaic is less
@@ -89,78 +92,97 @@ def _align(
     correlation: Array,
 ) -> None:
     """Align all patches; `pixels` holds the starts and then the places."""
-    side = len(window)
-    buffers = np.empty((4, side, side))
-    patch, by_u, by_v, seen = buffers[0], buffers[1], buffers[2], buffers[3]
+    side, total = len(window), window.sum()
+    weighted = np.empty((side, side, 3))  # gradient and patch, times the window
     for k in range(len(at)):
-        A = affine[k]
-        determinant = A[0, 0] * A[1, 1] - A[0, 1] * A[1, 0]
+        A = affine[k, 0, 0], affine[k, 0, 1], affine[k, 1, 0], affine[k, 1, 1]
+        determinant = A[0] * A[3] - A[1] * A[2]
         sound = (
             np.isfinite(pixels[k, 0] + pixels[k, 1] + determinant) and abs(determinant) > _LEAST_DETERMINANT
         )
-        if sound and _cut_out(source, at[k, 0], at[k, 1], A, window, patch, by_u, by_v):
-            power = (window * patch * patch).sum()
-            if power > window.sum() * _LEAST_VARIANCE:
-                found = pixels[k], information[k], correlation[k : k + 1]
-                _align_one(target, A, window, patch, by_u, by_v, seen, power, *found)
+        if sound and _holds(source, at[k, 0], at[k, 1], (1.0, 0.0, 0.0, 1.0), side // 2 + 1):
+            moments = _cut_out(source, at[k, 0], at[k, 1], A, window, total, weighted)
+            if moments[0] > total * _LEAST_VARIANCE:
+                found = _align_one(target, pixels[k, 0], pixels[k, 1], A, window, total, weighted, moments)
+                correlation[k] = found[0]
+                if found[0] > 0.0:
+                    pixels[k, 0], pixels[k, 1] = found[1], found[2]
+                    information[k, 0, 0], information[k, 1, 1] = found[3], found[5]
+                    information[k, 0, 1] = information[k, 1, 0] = found[4]
+
+
+@inlined
+def _holds(image: ImageF32, x: float, y: float, A: Map, reach: int) -> bool:
+    """Whether the corners that A gives a patch around (x, y), and so all of it, lie inside the image."""
+    across = (abs(A[0]) + abs(A[1])) * reach
+    down = (abs(A[2]) + abs(A[3])) * reach
+    height, width = image.shape
+    return x - across >= 0 and y - down >= 0 and x + across < width - 1 and y + down < height - 1
 
 
 @inlined
 def _cut_out(
-    image: ImageF32, u: int, v: int, A: Array, window: Array, patch: Array, by_u: Array, by_v: Array
-) -> bool:
-    """The patch around (u, v) without its mean, and its gradient by pixels of the target: A⁻ᵀ∇."""
+    image: ImageF32, u: int, v: int, A: Map, window: Array, total: float, weighted: Array
+) -> Moments:
+    """Fill `weighted` with gradient and patch around (u, v); the gradient is by the target's pixels, A⁻ᵀ∇.
+
+    Returned are the sums over the window w of p², ∇u, ∇v, ∇u p, ∇v p, ∇u², ∇u ∇v and ∇v²; p is the patch
+    without its mean.
+    """
     side = len(window)
     left, top = u - side // 2, v - side // 2
-    if left < 1 or top < 1 or left + side >= image.shape[1] or top + side >= image.shape[0]:
-        return False
-    determinant = A[0, 0] * A[1, 1] - A[0, 1] * A[1, 0]
-    mean = 0.0
+    determinant = A[0] * A[3] - A[1] * A[2]
+    level = np.float64(image[v, u])  # near all values: sums of squares keep their digits
+    s, pp, mu, mv, pu, pv, uu, uv, vv = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
     for r in range(side):
         for c in range(side):
-            row, column = top + r, left + c
-            du = 0.5 * (image[row, column + 1] - image[row, column - 1])
-            dv = 0.5 * (image[row + 1, column] - image[row - 1, column])
-            by_u[r, c] = (A[1, 1] * du - A[1, 0] * dv) / determinant
-            by_v[r, c] = (A[0, 0] * dv - A[0, 1] * du) / determinant
-            patch[r, c] = image[row, column]
-            mean += window[r, c] * patch[r, c]
-    patch -= mean / window.sum()
-    return True
+            row, column, w = top + r, left + c, window[r, c]
+            across = 0.5 * (image[row, column + 1] - image[row, column - 1])
+            down = 0.5 * (image[row + 1, column] - image[row - 1, column])
+            gu, gv = (A[3] * across - A[2] * down) / determinant, (A[0] * down - A[1] * across) / determinant
+            p = image[row, column] - level
+            wu, wv, wp = w * gu, w * gv, w * p
+            weighted[r, c, 0], weighted[r, c, 1], weighted[r, c, 2] = wu, wv, wp
+            s, pp, mu, mv = s + wp, pp + wp * p, mu + wu, mv + wv
+            pu, pv, uu, uv, vv = pu + wu * p, pv + wv * p, uu + wu * gu, uv + wu * gv, vv + wv * gv
+    mean = s / total
+    for r in range(side):
+        for c in range(side):
+            weighted[r, c, 2] -= mean * window[r, c]
+    return pp - mean * s, mu, mv, pu - mean * mu, pv - mean * mv, uu, uv, vv
 
 
 @inlined
 def _align_one(
     target: ImageF32,
-    A: Array,
+    x: float,
+    y: float,
+    A: Map,
     window: Array,
-    patch: Array,
-    by_u: Array,
-    by_v: Array,
-    seen: Array,
-    power: float,
-    pixel: Array,
-    information: Array,
-    correlation: Array,
-) -> None:
-    """Gauss-Newton on the place of one patch; its correlation is −1 where it is lost."""
-    total, x, y, residual = window.sum(), pixel[0], pixel[1], 0.0
-    huu, huv, hvv = _curvature(window, patch, by_u, by_v, power)
+    total: float,
+    weighted: Array,
+    moments: Moments,
+) -> tuple[float, float, float, float, float, float]:
+    """Gauss-Newton on the place of one patch: correlation (−1: lost), place, and information uu, uv, vv."""
+    lost = (-1.0, x, y, 0.0, 0.0, 0.0)
+    power, mu, mv, pu, pv, uu, uv, vv = moments
+    # Offset and gain marginalised: gradients without their parts along 1 and the patch.
+    huu = uu - mu * mu / total - pu * pu / power
+    huv = uv - mu * mv / total - pu * pv / power
+    hvv = vv - mv * mv / total - pv * pv / power
     ridge = _RIDGE * (huu + hvv) + 1e-9
     determinant = (huu + ridge) * (hvv + ridge) - huv * huv
+    residual, correlation = 0.0, -1.0
     for _ in range(_ITERATIONS):
-        if not _sample(target, x, y, A, window, seen):
-            correlation[0] = -1.0
-            return
-        cross, square = (window * seen * patch).sum(), (window * seen * seen).sum()
+        if not _holds(target, x, y, A, len(window) // 2):
+            return lost
+        square, along_u, along_v, cross = _compare(target, x, y, A, window, total, weighted, mu, mv)
         gain = cross / power
         if gain < _LEAST_GAIN:
-            correlation[0] = -1.0
-            return
-        correlation[0] = cross / np.sqrt(square * power + 1e-12)
-        error = seen / gain - patch
-        gu, gv = (window * by_u * error).sum(), (window * by_v * error).sum()
-        residual = (window * error * error).sum()
+            return lost
+        correlation = cross / np.sqrt(square * power + 1e-12)
+        gu, gv = along_u / gain - pu, along_v / gain - pv
+        residual = max(square / gain**2 - power, 0.0)
         step_u = (huv * gv - (hvv + ridge) * gu) / determinant
         step_v = (huv * gu - (huu + ridge) * gv) / determinant
         length = np.sqrt(step_u * step_u + step_v * step_v)
@@ -170,42 +192,37 @@ def _align_one(
             break
     noise = _NOISE_GRADIENT * residual
     scale = _INDEPENDENT_SHARE / max(residual / total, _MIN_SIGMA_LEVELS**2)
-    pixel[0], pixel[1] = x, y
-    information[0, 0], information[1, 1] = (huu - noise) * scale, (hvv - noise) * scale
-    information[0, 1] = information[1, 0] = huv * scale
+    return correlation, x, y, (huu - noise) * scale, huv * scale, (hvv - noise) * scale
 
 
 @inlined
-def _curvature(
-    window: Array, patch: Array, by_u: Array, by_v: Array, power: float
-) -> tuple[float, float, float]:
-    """Σ w ∇∇ᵀ with offset and gain marginalised: gradients without their parts along 1 and the patch."""
-    total = window.sum()
-    mu, mv = (window * by_u).sum(), (window * by_v).sum()
-    pu, pv = (window * by_u * patch).sum(), (window * by_v * patch).sum()
-    return (
-        (window * by_u * by_u).sum() - mu * mu / total - pu * pu / power,
-        (window * by_u * by_v).sum() - mu * mv / total - pu * pv / power,
-        (window * by_v * by_v).sum() - mv * mv / total - pv * pv / power,
-    )
-
-
-@inlined
-def _sample(target: ImageF32, x: float, y: float, A: Array, window: Array, seen: Array) -> bool:
-    """The target's values, without their mean, where A maps the patch's pixels; False outside."""
+def _compare(
+    target: ImageF32,
+    x: float,
+    y: float,
+    A: Map,
+    window: Array,
+    total: float,
+    weighted: Array,
+    mu: float,
+    mv: float,
+) -> tuple[float, float, float, float]:
+    """Sums of w t², ∇u t, ∇v t and p t over the window; t are the target's values without their mean."""
     side = len(window)
-    reach, mean = side // 2, 0.0
+    reach = side // 2
+    level = np.float64(target[int(y), int(x)])
+    s, tt, ut, vt, pt = 0.0, 0.0, 0.0, 0.0, 0.0
     for r in range(side):
         for c in range(side):
-            px = x + A[0, 0] * (c - reach) + A[0, 1] * (r - reach)
-            py = y + A[1, 0] * (c - reach) + A[1, 1] * (r - reach)
-            if px < 0 or py < 0 or px >= target.shape[1] - 1 or py >= target.shape[0] - 1:
-                return False
+            px = x + A[0] * (c - reach) + A[1] * (r - reach)
+            py = y + A[2] * (c - reach) + A[3] * (r - reach)
             column, row = int(px), int(py)
             a, b = px - column, py - row
-            upper = (1.0 - a) * target[row, column] + a * target[row, column + 1]
-            lower = (1.0 - a) * target[row + 1, column] + a * target[row + 1, column + 1]
-            seen[r, c] = (1.0 - b) * upper + b * lower
-            mean += window[r, c] * seen[r, c]
-    seen -= mean / window.sum()
-    return True
+            upper = target[row, column] + a * (target[row, column + 1] - target[row, column])
+            lower = target[row + 1, column] + a * (target[row + 1, column + 1] - target[row + 1, column])
+            t = upper + b * (lower - upper) - level
+            wt = window[r, c] * t
+            s, tt = s + wt, tt + wt * t
+            ut, vt, pt = ut + weighted[r, c, 0] * t, vt + weighted[r, c, 1] * t, pt + weighted[r, c, 2] * t
+    mean = s / total
+    return tt - mean * s, ut - mean * mu, vt - mean * mv, pt

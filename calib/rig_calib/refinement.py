@@ -6,21 +6,21 @@ where a wall is blank, depth is compared alone (a point-to-plane term). What is 
 keypoints in the same adjustment.
 """
 
-import os
 from collections.abc import Mapping, Sequence, Set
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from types import MappingProxyType
 
 import cv2
 import numpy as np
 import numpy.typing as npt
+import scipy.spatial
 
 from rig_calib.depth_model import DepthCorrection
 from rig_calib.features import Keypoints
 from rig_calib.matching import Matches
 from rig_calib.observed_camera import ObservedCamera
 from rig_calib.overlap import Region
+from rig_calib.parallel import in_threads
 from rig_calib.patch_alignment import RADIUS_PX, ImageF32, align_patches
 from rig_calib.projection import inside
 from rig_calib.surface_transfer import surface_planes, transfer, transfer_affine
@@ -78,7 +78,8 @@ def refine(
     `prediction_px` is the standard deviation, in pixels, with which the poses predict where a patch lies.
     Pairs of `depth_only` compare depth alone, which leads to the right place from farther away than texture.
     """
-    spread = {c: _spread_pixels(camera.image) for c, camera in cameras.items() if c in poses}
+    placed = [c for c in cameras if c in poses]
+    spread = dict(zip(placed, in_threads(lambda c: _spread_pixels(cameras[c].image), placed), strict=True))
     pairs = [pair for pair in regions if pair[0] in poses and pair[1] in poses]
 
     def align(pair: Pair) -> list[_Half]:
@@ -88,8 +89,7 @@ def refine(
             return found
         return [_keypoint_half(cameras, pair, keypoint_matches.get(pair, _NO_MATCHES))]
 
-    with ThreadPoolExecutor(os.cpu_count()) as pool:  # the compiled loops run without the interpreter's lock
-        halves = [half for both in pool.map(align, pairs) for half in both]
+    halves = [half for both in in_threads(align, pairs) for half in both]
     return _collect(cameras, halves)
 
 
@@ -205,8 +205,8 @@ def _near(pixels: Index, taken: Array) -> Mask:
     """Which pixels (N,2) have one of `taken` (K,2) within a patch's reach."""
     if not len(taken) or not len(pixels):
         return np.zeros(len(pixels), dtype=bool)
-    squared = ((pixels[:, None] - taken[None]) ** 2).sum(axis=2)
-    return np.asarray(squared.min(axis=1) < (0.75 * _CELL_PX) ** 2)
+    distance_px, _ = scipy.spatial.KDTree(taken).query(pixels, distance_upper_bound=0.75 * _CELL_PX)
+    return np.isfinite(distance_px)
 
 
 def _collect(cameras: Mapping[int, ObservedCamera], halves: Sequence[_Half]) -> RefinedRig:
@@ -232,10 +232,11 @@ def _collect(cameras: Mapping[int, ObservedCamera], halves: Sequence[_Half]) -> 
         }
         pair = min(ends), max(ends)
         matches.setdefault(pair, []).append(np.column_stack([ends[pair[0]], ends[pair[1]]]))
-    refined = {
-        c: camera.with_keypoints(_keypoints(pixels[c], information[c])) for c, camera in cameras.items()
-    }
-    return RefinedRig(refined, {pair: np.concatenate(rows) for pair, rows in matches.items()})
+    refined = in_threads(lambda c: cameras[c].with_keypoints(_keypoints(pixels[c], information[c])), cameras)
+    return RefinedRig(
+        dict(zip(cameras, refined, strict=True)),
+        {pair: np.concatenate(rows) for pair, rows in matches.items()},
+    )
 
 
 def _keypoints(pixels: Sequence[Array], information: Sequence[Array]) -> Keypoints:

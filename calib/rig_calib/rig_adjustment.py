@@ -1,12 +1,13 @@
 """The joint estimate: all poses, points and depth-bias states of observed cameras in one adjustment."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from types import MappingProxyType
 
 import numpy as np
 import numpy.typing as npt
 
-from rig_calib.bundle_adjustment import AdjustedCamera, Adjustment, adjust
+from rig_calib.bundle_adjustment import CONVERGED, AdjustedCamera, Adjustment, adjust
 from rig_calib.depth_model import DepthCorrection, DepthGrid, depth_basis
 from rig_calib.matching import Matches
 from rig_calib.noise import NoiseModel, observed_noise
@@ -14,7 +15,7 @@ from rig_calib.observation_model import GRID_INTRINSIC_TERMS, GRID_POSE_TERMS, C
 from rig_calib.observed_camera import ObservedCamera
 from rig_calib.projection import from_pixels
 from rig_calib.settings import CalibrationSettings
-from rig_calib.shared_planes import SharedPlanes
+from rig_calib.shared_planes import NOTHING_SHARED, SharedPlanes
 from rig_calib.tracks import Scene, build_scene, build_tracks
 from rig_calib.uncertainty import PoseCovariance, pose_covariance
 from rig_calib.view import CameraView
@@ -77,6 +78,11 @@ class AdjustedRig:
     adjustment: Adjustment
     noise: NoiseModel
 
+    @property
+    def states(self) -> dict[int, CameraState]:
+        """What was estimated of every camera, by id."""
+        return dict(zip(self.scene.cameras, self.adjustment.states, strict=True))
+
     def covariance_of(self, camera_id: int) -> Array:
         """Covariance (6,6) of one camera's pose in the adjustment's frame."""
         return self.covariance.of(self.scene.cameras.index(camera_id))
@@ -111,28 +117,31 @@ def adjust_rig(
     ring: RingDrawing | None,
     settings: CalibrationSettings,
     noise: NoiseModel = AT_REST,
-    shared: SharedPlanes | None = None,
+    states: Mapping[int, CameraState] = MappingProxyType({}),
+    shared: SharedPlanes = NOTHING_SHARED,
+    converged: float = CONVERGED,
 ) -> AdjustedRig:
     """Adjust the cameras that have a start in `poses` from matches that are believed.
 
     With a `ring` the drawing's poses and tolerance are a prior and define the frame; without one the
-    first camera does.
+    first camera does. What `states` say beside the poses is where these start; where is none, at the factory
+    models.
     """
     tracks = build_tracks(cameras, {pair: rows for pair, rows in matches.items() if set(pair) <= set(poses)})
     scene = build_scene(cameras, tracks, poses, noise)
     drawn = ring is not None and any(cameras[c].view.T_rig_nominal is not None for c in poses)
     adjusted = [
         _adjusted_camera(
-            cameras[c], poses[c], ring if drawn else None, not drawn and c == scene.cameras[0], settings
+            cameras[c],
+            _start(poses[c], states.get(c), settings),
+            ring if drawn else None,
+            not drawn and c == scene.cameras[0],
+            settings,
         )
         for c in scene.cameras
     ]
     result = adjust(
-        adjusted,
-        scene.points,
-        scene.observations,
-        None if shared is None else shared.planes,
-        None if shared is None else shared.seen,
+        adjusted, scene.points, scene.observations, shared.planes, shared.seen, converged=converged
     )
     states = dict(zip(scene.cameras, result.states, strict=True))
     return AdjustedRig(
@@ -153,8 +162,18 @@ def model_sigmas(view: CameraView) -> tuple[Array, Array, Array]:
     return sigma.intrinsics, sigma.grid_pose, sigma.grid_intrinsics
 
 
+def _start(T_rig_camera: Pose, known: CameraState | None, settings: CalibrationSettings) -> CameraState:
+    if known is None:
+        return CameraState(T_rig_camera, np.zeros(settings.bias_terms))
+    return replace(known, T_rig_camera=T_rig_camera)
+
+
 def _adjusted_camera(
-    camera: ObservedCamera, start: Pose, ring: RingDrawing | None, fixed: bool, settings: CalibrationSettings
+    camera: ObservedCamera,
+    start: CameraState,
+    ring: RingDrawing | None,
+    fixed: bool,
+    settings: CalibrationSettings,
 ) -> AdjustedCamera:
     model = camera.view.model
     pose_sigma = None
@@ -164,7 +183,7 @@ def _adjusted_camera(
     return AdjustedCamera(
         color=model.color,
         grid=camera.grid,
-        start=CameraState(start, np.zeros(settings.bias_terms)),
+        start=start,
         bias_sigma=bias_sigma(camera.grid, settings),
         intrinsics_sigma=intrinsics_sigma,
         grid_pose_sigma=grid_pose_sigma,

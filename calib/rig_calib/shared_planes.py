@@ -5,9 +5,7 @@ camera has another plane that could be meant, and when both see it in one place 
 another one, as a door is or a shelf in front of it.
 """
 
-import os
 from collections.abc import Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 import numpy as np
@@ -21,6 +19,7 @@ from rig_calib.depth_planes import HALF_CELL_PX, DepthPlane, cell_places, depth_
 from rig_calib.keypoint_depth import window_sigma
 from rig_calib.observation_model import CameraState, PlaneObservations
 from rig_calib.observed_camera import ObservedCamera
+from rig_calib.parallel import in_threads
 from rig_calib.projection import project
 from rig_calib.surface_transfer import transform_planes
 from rig_protocol.poses import Pose, inverse, transform_points
@@ -48,9 +47,12 @@ class SharedPlanes:
     seen: PlaneObservations
 
 
+NOTHING_SHARED = SharedPlanes(np.empty((0, 3)), PlaneObservations.none())
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class _Found:
-    """A plane that the camera at a position in the adjustment sees, T_rig_grid being its depth camera's pose."""
+    """A plane that one camera of the adjustment sees; T_rig_grid is its depth camera's pose."""
 
     camera: int
     side: ObservedCamera
@@ -65,7 +67,7 @@ def find_shared_planes(
     sides = [cameras[c] for c in order]
     found = _found(sides, adjustment.states)
     if not found:
-        return SharedPlanes(np.empty((0, 3)), PlaneObservations.none())
+        return NOTHING_SHARED
     seen = _observations(found)
     starts = [transform_planes(one.T_rig_grid, one.plane.normal[None])[0] for one in found]
     carried = carry(np.array(starts), seen, sides, adjustment)
@@ -76,16 +78,15 @@ def find_shared_planes(
 
 
 def _found(sides: Sequence[ObservedCamera], states: Sequence[CameraState]) -> list[_Found]:
-    def find(side: ObservedCamera, state: CameraState) -> list[DepthPlane]:
+    def find(side_and_state: tuple[ObservedCamera, CameraState]) -> list[DepthPlane]:
+        side, state = side_and_state
         bias = tuple(state.bias.tolist())
         return depth_planes(side.grid, side.disparity, DepthCorrection(bias) if bias else None)
 
-    with ThreadPoolExecutor(os.cpu_count()) as pool:
-        planes = list(pool.map(find, sides, states))
     return [
-        _Found(c, side, states[c].T_rig_camera @ side.grid.T_color_grid, plane)
-        for c, side in enumerate(sides)
-        for plane in planes[c]
+        _Found(c, sides[c], states[c].T_rig_camera @ sides[c].grid.T_color_grid, plane)
+        for c, planes in enumerate(in_threads(find, zip(sides, states, strict=True)))
+        for plane in planes
     ]
 
 

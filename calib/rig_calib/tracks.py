@@ -1,6 +1,6 @@
 """Tracks: matches of pairs joined to points that two or more cameras observe, ready to be adjusted."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -13,8 +13,6 @@ from rig_calib.observed_camera import ObservedCamera
 from rig_protocol.poses import Pose, transform_points
 
 Array = npt.NDArray[np.float64]
-Track = dict[int, int]
-"""Keypoint row by camera id."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -26,14 +24,39 @@ class Scene:
     points: Array
 
 
-def build_tracks(
-    cameras: Mapping[int, ObservedCamera], matches: Mapping[tuple[int, int], Matches]
-) -> list[Track]:
+@dataclass(frozen=True, slots=True, eq=False)
+class Tracks:
+    """`count` tracks; observation m is keypoint `row` (M,) of the camera with id `camera` (M,) on `track`.
+
+    The observations of a track stand together.
+    """
+
+    count: int
+    track: npt.NDArray[np.intp]
+    camera: npt.NDArray[np.intp]
+    row: npt.NDArray[np.intp]
+
+
+def build_tracks(cameras: Mapping[int, ObservedCamera], matches: Mapping[tuple[int, int], Matches]) -> Tracks:
     """Join matches that share a place into tracks; what would give a camera two places is left out."""
     if _every_place_once(cameras, matches):
-        return [{i: a, j: b} for (i, j), pairs in sorted(matches.items()) for a, b in pairs.tolist()]
+        return _pairs_as_tracks(matches)
+    return _joined_tracks(cameras, matches)
+
+
+def _pairs_as_tracks(matches: Mapping[tuple[int, int], Matches]) -> Tracks:
+    """Every match a track of its own."""
+    ordered = sorted(matches.items())
+    rows = np.concatenate([np.empty((0, 2), np.intp), *(pairs for _, pairs in ordered)])
+    ids = [np.empty((0, 2), np.intp), *(np.tile(pair, (len(pairs), 1)) for pair, pairs in ordered)]
+    return Tracks(len(rows), np.repeat(np.arange(len(rows)), 2), np.concatenate(ids).ravel(), rows.ravel())
+
+
+def _joined_tracks(
+    cameras: Mapping[int, ObservedCamera], matches: Mapping[tuple[int, int], Matches]
+) -> Tracks:
     parent: dict[tuple[int, int], tuple[int, int]] = {}
-    tracks: dict[tuple[int, int], Track] = {}
+    rows_of: dict[tuple[int, int], dict[int, int]] = {}  # of a track, by camera id
 
     def root(node: tuple[int, int]) -> tuple[int, int]:
         while parent[node] != node:
@@ -47,12 +70,18 @@ def build_tracks(
             ends = ((i, int(places_i[a])), (j, int(places_j[b])))
             for node, row in zip(ends, (a, b), strict=True):
                 if node not in parent:
-                    parent[node], tracks[node] = node, {node[0]: row}
+                    parent[node], rows_of[node] = node, {node[0]: row}
             first, second = root(ends[0]), root(ends[1])
-            if first != second and not tracks[first].keys() & tracks[second].keys():
+            if first != second and not rows_of[first].keys() & rows_of[second].keys():
                 parent[second] = first
-                tracks[first].update(tracks.pop(second))
-    return [track for track in tracks.values() if len(track) > 1]
+                rows_of[first].update(rows_of.pop(second))
+    found = [rows for rows in rows_of.values() if len(rows) > 1]
+    return Tracks(
+        len(found),
+        np.repeat(np.arange(len(found)), [len(rows) for rows in found]),
+        np.array([camera for rows in found for camera in rows], dtype=np.intp),
+        np.array([row for rows in found for row in rows.values()], dtype=np.intp),
+    )
 
 
 def _every_place_once(
@@ -68,20 +97,14 @@ def _every_place_once(
 
 
 def build_scene(
-    cameras: Mapping[int, ObservedCamera],
-    tracks: Sequence[Track],
-    poses: Mapping[int, Pose],
-    noise: NoiseModel,
+    cameras: Mapping[int, ObservedCamera], tracks: Tracks, poses: Mapping[int, Pose], noise: NoiseModel
 ) -> Scene:
     """Observations of the tracks that have depth in at least one camera, points started from that depth."""
     ids = tuple(sorted(poses))
-    position = {camera_id: k for k, camera_id in enumerate(ids)}
-    camera = np.array([position[c] for track in tracks for c in track], dtype=np.intp)
-    row = np.array([r for track in tracks for r in track.values()], dtype=np.intp)
-    point = np.repeat(np.arange(len(tracks)), [len(track) for track in tracks])
-    observed = _Columns(cameras, ids, camera, row)
+    camera, point = np.searchsorted(ids, tracks.camera), tracks.track
+    observed = _Columns(cameras, ids, camera, tracks.row)
     start = observed.gather(lambda c: transform_points(poses[c.view.camera_id], c.points), 3)
-    points, with_depth = _mean_points(point, start, len(tracks))
+    points, with_depth = _mean_points(point, start, tracks.count)
     number = np.cumsum(with_depth) - 1
     observations = _observations(observed, number[point], noise)
     return Scene(ids, observations.select(with_depth[point]), points[with_depth])

@@ -6,9 +6,7 @@ from rig_calib.depth_model import DepthCorrection, disparity_of_depth
 from rig_calib.depth_planes import depth_planes
 from support.flat_rooms import GRID, RAYS, Piece, Unit, box, inverse_depth
 
-LOOKING = np.array(
-    [[0.0, 0.0, 1.0, 0.1], [-1.0, 0.0, 0.0, 0.0], [0.0, -1.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]]
-)
+LOOKING = np.array([[0.0, 0.0, 1.0, 0.1], [-1.0, 0.0, 0.0, 0.0], [0.0, -1.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]])
 """T_rig_grid of a level camera that looks along x."""
 RNG = np.random.default_rng
 

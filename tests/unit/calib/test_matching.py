@@ -7,7 +7,7 @@ import numpy as np
 
 from rig_calib.features import Keypoints, detect, detect_coarsely, mean_grey
 from rig_calib.matching import flann_matches, mutual_matches
-from rig_calib.overlap import Region, shared_regions, whole_image
+from rig_calib.overlap import Region, joined, shared_regions, whole_image
 from rig_protocol.camera import Intrinsics
 from rig_protocol.rig_folder import RingDrawing
 
@@ -78,10 +78,34 @@ def test_keypoints_of_half_the_image_lie_where_the_whole_one_has_them() -> None:
     """A blob is found without a shift, and information by the whole pixel."""
     v, u = np.mgrid[:200, :200]
     image = (40 + 180 * np.exp(-((u - 100.3) ** 2 + (v - 80.7) ** 2) / (2 * 6.0**2))).astype(np.uint8)
-    found = detect_coarsely(image, Region(0, 0, 200, 200), 100, SIGMA_PX)
+    found = detect_coarsely(image, [Region(0, 0, 200, 200)], 100, SIGMA_PX)
     nearest = np.linalg.norm(found.pixels - (100.3, 80.7), axis=1).argmin()
     np.testing.assert_allclose(found.pixels[nearest], (100.3, 80.7), atol=0.1)
     assert np.sqrt(1 / found.information[nearest, 0, 0]) >= 2 * SIGMA_PX
+
+
+def test_keypoints_for_a_start_are_spread_where_one_corner_has_most_of_the_texture() -> None:
+    image = noise_image()
+    image[240:] = cv2.GaussianBlur(image, (0, 0), 3.0)[240:]  # larger blobs, and fewer
+    regions = [Region(0, 0, 640, 200), Region(0, 280, 640, 480)]
+    found = detect_coarsely(image, regions, 3000, SIGMA_PX)
+    counts = [region.contains(found.pixels).sum() for region in regions]
+    assert min(counts) > 0.4 * sum(counts)
+    assert len(np.unique(found.place)) == len(np.unique(found.pixels.round(3), axis=0))
+
+
+def test_regions_that_meet_become_one() -> None:
+    left, right, apart = Region(0, 0, 100, 100), Region(90, 20, 200, 120), Region(300, 0, 400, 50)
+    assert joined([left, apart, right]) == [apart, Region(0, 0, 200, 120)]
+    assert joined([left, apart]) == [left, apart]
+
+
+def test_tiles_cover_a_region_once() -> None:
+    tiles = Region(10, 20, 330, 140).tiles(160)
+    assert len(tiles) == 2
+    v, u = np.mgrid[20:140, 10:330]
+    inside = sum(tile.contains(np.column_stack([u.ravel(), v.ravel()]) + 0.25) for tile in tiles)
+    assert (np.asarray(inside) == 1).all()
 
 
 def test_large_keypoints_are_placed_less_well() -> None:

@@ -43,7 +43,8 @@ def cameras() -> Mapping[int, ObservedCamera]:
     panorama = PanoramicFrame.of(0, {c: rig.camera(c).frame(0) for c in PAIR})
     views = views_from_panoramas(rig_description(SETTINGS), [panorama])
     return {
-        view.camera_id: observe(view, whole_image(view.model.color), CalibrationSettings()) for view in views
+        view.camera_id: observe(view, [whole_image(view.model.color)], CalibrationSettings())
+        for view in views
     }
 
 

@@ -1,7 +1,6 @@
 """Which planes of different cameras are one wall, and what walls alone say about a rig."""
 
 from collections.abc import Sequence
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -64,9 +63,7 @@ def cameras_of(shared: SharedPlanes) -> list[set[int]]:
 
 def wall(distance_m: float, low: float = -np.inf, high: float = np.inf) -> Piece:
     """A wall that faces slot 0, between two places to its left."""
-    return Piece(
-        np.array([1.0 / distance_m, 0, 0]), np.array([-9.0, low, -9.0]), np.array([9.0, high, 9.0])
-    )
+    return Piece(np.array([1.0 / distance_m, 0, 0]), np.array([-9.0, low, -9.0]), np.array([9.0, high, 9.0]))
 
 
 def test_neighbours_share_the_wall_that_both_see() -> None:
