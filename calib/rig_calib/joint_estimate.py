@@ -1,7 +1,7 @@
 """The joint estimate: poses, points and what is wrong with every camera in one adjustment, on patches.
 
 Keypoints start it. Then patches are looked for where the poses predict them, and again while the poses move;
-walls and floor that cameras share join them as soon as the noise is taken for what it is.
+where a pair is left that is known too little, walls and floor that cameras share join them.
 Pairs that only the drawing predicts are led by depth first, with noise that goes down to what it is.
 """
 
@@ -72,7 +72,7 @@ def estimate_jointly(
     keypoint_matches = {edge.pair: edge.agreeing_matches for edge in edges if edge.reason is None}
     rig = adjust_rig(cameras, keypoint_matches, start, ring, settings, converged=ROUGHLY_CONVERGED)
     far = {pair for pair, px in _prediction_px(rig, regions).items() if px > _FAR_AND_WIDE_PX}
-    noise, shared = AT_REST, NOTHING_SHARED
+    noise = AT_REST
     for k in range(_MAX_ROUNDS):
         before, prediction_px = rig.poses, _prediction_px(rig, regions)
         depth_only = far if k < _DEPTH_ROUNDS else set()
@@ -82,14 +82,15 @@ def estimate_jointly(
         matches = _verified(refined, far - depth_only, prediction_px, settings)
         graduated = bool(far) and k < len(_GRADUATED_NOISE)
         assumed = _GRADUATED_NOISE[k] if graduated else noise
-        if shared is NOTHING_SHARED and not graduated:
-            shared = find_shared_planes(cameras, rig.scene.cameras, rig.adjustment)
-        rig = adjust_rig(refined.cameras, matches, before, ring, settings, assumed, rig.states, shared)
+        rig = adjust_rig(refined.cameras, matches, before, ring, settings, assumed, rig.states)
         if not graduated:
             noise = rig.observed_noise()
             if _largest_shift_px(before, rig.poses, regions) < _SETTLED_PX:
                 break
-    if noise.differs_from(rig.noise):
+    shared = NOTHING_SHARED
+    if _any_weak(rig, regions, settings):
+        shared = find_shared_planes(cameras, rig.scene.cameras, rig.adjustment)
+    if noise.differs_from(rig.noise) or len(shared.planes):
         rig = adjust_rig(refined.cameras, matches, rig.poses, ring, settings, noise, rig.states, shared)
     judged = in_threads(lambda edge: _refined_edge(edge, refined, matches, rig, settings), edges)
     return JointEstimate(rig, refined.cameras, tuple(judged))
@@ -150,6 +151,13 @@ def _refined_edge(
         return replace(edge, matches=_NO_MATCHES, inlier=np.zeros(0, dtype=bool), reason=reason)
     T_i_j = inverse(rig.poses[i]) @ rig.poses[j]
     return estimate_edge(refined.cameras[i], refined.cameras[j], rows, T_i_j, settings, rig.states)
+
+
+def _any_weak(rig: AdjustedRig, pairs: Iterable[Pair], settings: CalibrationSettings) -> bool:
+    """Whether the gate would refuse a pair: only there do shared planes know more than patches do."""
+    sigmas = [weakest_direction(rig.relative(i, j)[1]) for i, j in pairs if i in rig.poses and j in rig.poses]
+    limits = settings.max_pair_sigma_deg, settings.max_pair_sigma_m
+    return any(deg > limits[0] or metres > limits[1] for deg, metres in sigmas)
 
 
 def _prediction_px(rig: AdjustedRig, pairs: Iterable[Pair]) -> dict[Pair, float]:
