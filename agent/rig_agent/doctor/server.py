@@ -73,7 +73,8 @@ def _await_answer(transport: Transport, link: AgentLink, settings: AgentSettings
     while (time_ns := now_ns()) < end_ns:
         for datagram in link.datagrams_to_send(time_ns):
             transport.send_datagram(datagram)
-        select.select([transport.fileno()], [], [], _TURN_NS / 1e9)
+        descriptors = [fd for fd in (transport.fileno(),) if fd is not None]
+        select.select(descriptors, [], [], _TURN_NS / 1e9)
         for datagram in transport.receive():
             link.receive_datagram(datagram, now_ns())
         match link.next_event():
