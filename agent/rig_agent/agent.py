@@ -135,6 +135,7 @@ class Agent:
         if hello is not None and hello is not self._introduced:
             self._introduced = hello
             self._uplink.introduce(hello, time_ns)
+        self._uplink.report_gravity(self._capture.gravity)
         # Control first: cutting a frame takes a millisecond, which the clock exchange would feel.
         self._uplink.serve(time_ns)
         self._wanted = self._uplink.wanted

@@ -13,6 +13,7 @@ from rig_protocol.agent_session import is_due
 from rig_protocol.datagram import DatagramBatch
 from rig_protocol.events import AgentEvent, Connected, Disconnected, Rejected
 from rig_protocol.frames import EncodedFrame
+from rig_protocol.gravity import Gravity
 from rig_protocol.messages import Hello, StreamPlan, Welcome
 from rig_protocol.rig_key import RigKey
 from rig_protocol.system_clock import SystemClockReading
@@ -115,6 +116,11 @@ class Uplink:
         """What the next heartbeats tell the server."""
         if self._link is not None:
             self._link.report_health(gauges)
+
+    def report_gravity(self, gravity: Gravity | None) -> None:
+        """Down as the camera feels it now; the next heartbeats tell the server."""
+        if self._link is not None:
+            self._link.gravity = gravity
 
     def fileno(self) -> int | None:
         """For a selector; changes when the transport opens anew."""

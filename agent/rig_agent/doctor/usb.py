@@ -13,7 +13,6 @@ from rig_agent.usb.enumerate import KinectCamera, UsbDevice
 from rig_protocol.errors import ConfigurationError
 from rig_protocol.troubleshooting import Topic
 
-_MOTOR_1414 = 0x02B0  # the later models' motor is behind their audio device
 _HIGH_SPEED = 3  # of libusb's enum; 480 Mbit/s
 _REPLUG_RULES = "sudo udevadm control --reload && sudo udevadm trigger"
 _FIRMWARE = "audios.bin"
@@ -46,7 +45,7 @@ def usb(machine: Machine, settings: AgentSettings) -> list[Finding]:
 
 def _absent(devices: Sequence[UsbDevice], cameras: Sequence[KinectCamera], error: SourceLost) -> Finding:
     text = str(error)
-    if not cameras and any(device.idProduct in (_MOTOR_1414, *usb_bus.AUDIO) for device in devices):
+    if not cameras and any(device.idProduct in (usb_bus.MOTOR_1414, *usb_bus.AUDIO) for device in devices):
         text = "a Kinect's motor or audio answers, its camera does not: its own 12-V supply is missing"
     return failed(Check.KINECT, text, "lsusb -d 045e:", Topic.NO_KINECT, hardware=True)
 
@@ -54,7 +53,7 @@ def _absent(devices: Sequence[UsbDevice], cameras: Sequence[KinectCamera], error
 def _functions(camera: KinectCamera, beside: Sequence[UsbDevice]) -> Finding:
     present = {device.idProduct for device in beside}
     missing = [] if present & set(usb_bus.AUDIO) else ["audio"]
-    if camera.model == "1414" and _MOTOR_1414 not in present:
+    if camera.model == "1414" and usb_bus.MOTOR_1414 not in present:  # later ones have it behind the audio
         missing.append("motor")
     if missing:
         return warning(

@@ -15,7 +15,7 @@ from rig_protocol.troubleshooting import Topic
 
 MICROSOFT = 0x045E
 CAMERA_1414_1473, CAMERA_K4W = 0x02AE, 0x02BF
-MOTORS = (0x02B0, 0x02C2)
+MOTOR_1414 = 0x02B0
 AUDIO = (0x02AD, 0x02BE, 0x02BB, 0x02C3)
 _REVISION_1414 = 0x010B  # of the device descriptor; libfreenect tells the models apart by it too
 
@@ -112,6 +112,13 @@ def choose_camera(cameras: Sequence[KinectCamera], serial: str | None, port_path
         "(`lsusb -d 045e:` lists it; motor without camera means: no power)",
         Topic.NO_KINECT,
     )
+
+
+def motor_beside(camera: KinectCamera, devices: Iterable[UsbDevice]) -> UsbDevice | None:
+    """The motor of the same Kinect, which holds its accelerometer; None for models without such a device."""
+    hub = _hub(camera.device)
+    beside = (device for device in devices if device.idProduct == MOTOR_1414 and _hub(device) == hub)
+    return None if hub is None else next(beside, None)
 
 
 def check_access(camera: KinectCamera) -> None:
