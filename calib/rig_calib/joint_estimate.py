@@ -39,6 +39,9 @@ _GRADUATED_NOISE = tuple(
     for pixels, steps in ((1.0, 4.0), (1.0, 2.0), (1.0, 1.0), (1.0, 0.5), (1.0, 0.3), (0.3, 0.15))
 )
 _FAR_AND_WIDE_PX = 4.0  # predictions worse than this find false places, too
+# This share of what has texture must look alike in the other camera, or the place is a wrong one: 0.30-0.60
+# was seen there, 0.66-0.93 at right places (simulated rooms without patterns).
+_LEAST_FOUND_SHARE = 0.63
 # Fewer patches that were found far from where the drawing has them may agree by chance.
 _MIN_PATCHES = 20
 _NO_MATCHES: Matches = np.empty((0, 2), dtype=np.intp)
@@ -73,12 +76,15 @@ def estimate_jointly(
     rig = adjust_rig(cameras, keypoint_matches, start, ring, settings, converged=ROUGHLY_CONVERGED)
     far = {pair for pair, px in _prediction_px(rig, regions).items() if px > _FAR_AND_WIDE_PX}
     noise = AT_REST
+    believed = dict(regions)
     for k in range(_MAX_ROUNDS):
         before, prediction_px = rig.poses, _prediction_px(rig, regions)
         depth_only = far if k < _DEPTH_ROUNDS else set()
         refined = refine(
-            cameras, regions, before, rig.corrections, prediction_px, depth_only, keypoint_matches
+            cameras, believed, before, rig.corrections, prediction_px, depth_only, keypoint_matches
         )
+        for pair in _misplaced(refined, far - depth_only):
+            del believed[pair], refined.matches[pair]
         matches = _verified(refined, far - depth_only, prediction_px, settings)
         graduated = bool(far) and k < len(_GRADUATED_NOISE)
         assumed = _GRADUATED_NOISE[k] if graduated else noise
@@ -123,6 +129,13 @@ def _verified(
         bare = (i, j) in far and len(agreed) < _MIN_PATCHES
         out[i, j] = _NO_MATCHES if bare else np.concatenate([agreed, rows[~textured]])
     return out
+
+
+def _misplaced(refined: RefinedRig, far: Set[Pair]) -> set[Pair]:
+    """Pairs that only the drawing predicted and whose textures do not look alike where their depth does."""
+    return {
+        pair for pair in far & refined.found_share.keys() if refined.found_share[pair] < _LEAST_FOUND_SHARE
+    }
 
 
 def _largest_shift_px(before: Mapping[int, Pose], after: Mapping[int, Pose], pairs: Iterable[Pair]) -> float:

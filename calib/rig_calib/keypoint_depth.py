@@ -83,6 +83,13 @@ def keypoint_depth(
     return KeypointDepth(planes[:, 0], planes[:, 1:], at, sigma)
 
 
+def on_one_plane(disparity: Array, grid_pixels: Array, half_px: int, filled: float) -> npt.NDArray[np.bool_]:
+    """(N,) whether one plane explains the window around each place, nothing missing but a share."""
+    planes = np.full((len(grid_pixels), 3), np.nan)
+    fitted_planes(disparity, grid_pixels, half_px, filled, _MAX_RMS, _MAX_WORST, planes)
+    return np.asarray(np.isfinite(planes[:, 0]))
+
+
 def keypoint_points(color: Intrinsics, grid: DepthGrid, pixels: Array, depth: KeypointDepth) -> Array:
     """Points (N,3) in the colour camera: on the keypoint's ray, as deep as the depth says; NaN = none."""
     rays = np.column_stack([undistort_pixels(color, pixels), np.ones(len(pixels))])

@@ -192,6 +192,7 @@ def _adjusted_camera(
         pose_sigma=pose_sigma,
         fixed_pose=fixed,
         gravity=camera.view.gravity,
+        gravity_sigma=float(np.deg2rad(camera.view.gravity_sigma_deg)),
     )
 
 

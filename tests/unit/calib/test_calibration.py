@@ -138,6 +138,41 @@ def test_a_rig_without_a_drawing_is_calibrated_relative_to_camera_0(solve: Calib
     assert not np.any(calibration.cameras[0].covariance)
 
 
+def test_gravity_is_weighed_as_its_view_says_and_the_calibration_tells_who_felt_it(
+    solve: Calibrate,
+) -> None:
+    """A camera that nobody matches: its mount leaves its tilt open, its accelerometer says it."""
+    rig = SyntheticRig(cameras=4)
+    down = np.array([0.0, 0.0, -1.0])
+
+    def felt(sigma_deg: float) -> CalibrationResult:
+        views = [
+            replace(view, gravity=rig.truth[c][:3, :3].T @ down, gravity_sigma_deg=sigma_deg)
+            for c, view in enumerate(rig.views())
+        ]
+        return solve(rig, views, change=blind(3))
+
+    silent, vague, sure = solve(rig, change=blind(3)), felt(10.0), felt(0.05)
+    assert "gravity_cameras" not in silent.calibration.provenance
+    assert sure.calibration.provenance["gravity_cameras"] == [0, 1, 2, 3]
+    tilts = [_tilt_sigma_deg(result, 3) for result in (silent, vague, sure)]
+    assert tilts[1] > 0.95 * tilts[0]
+    assert tilts[2] < 0.5 * tilts[0]
+
+
+def _tilt_sigma_deg(result: CalibrationResult, camera: int) -> float:
+    """About the optical axis, which lies level: relative to camera 0's frame, so that only tilt counts."""
+    assert result.rig is not None
+    return float(np.rad2deg(np.sqrt(result.rig.relative(0, camera)[1][2, 2])))
+
+
+def test_the_papers_method_tells_of_no_gravity(solve: Calibrate) -> None:
+    rig = SyntheticRig(cameras=3)
+    views = [replace(view, gravity=np.array([1.0, 0.0, 0.0])) for view in rig.views()]
+    calibration = solve(rig, views, SETTINGS.model_copy(update={"method": "paper"})).calibration
+    assert "gravity_cameras" not in calibration.provenance
+
+
 def test_the_same_input_gives_bit_identical_cameras_and_edges(solve: Calibrate) -> None:
     rig = SyntheticRig(cameras=4)
     first, second = (solve(rig).calibration.to_dict() for _ in range(2))
