@@ -1,5 +1,6 @@
 """Recordings of OpenNI2 through its own player: our writer's and its recorder's, whole, torn and foreign."""
 
+import struct
 import subprocess
 import sys
 import time
@@ -190,3 +191,11 @@ def test_a_recording_that_the_player_will_not_deliver_says_so(tmp_path: Path) ->
     path.write_bytes(path.read_bytes().replace(b"xnCropping\0", b"xnCropped!\0"))
     with play(path, timeout_s=0.5) as source, pytest.raises(DataError, match=r"no frame for 0\.5 s"):
         source.read(5.0)
+
+
+def test_a_recording_that_states_an_empty_image_is_refused(tmp_path: Path) -> None:
+    path = write_recording(tmp_path / "a.oni")
+    stated, empty = struct.pack("<III", 640, 480, 30), struct.pack("<III", 640, 0, 30)
+    path.write_bytes(path.read_bytes().replace(stated, empty))
+    with play(path) as source, pytest.raises(DataError, match="not as large as it says"):
+        source.read(3.0)

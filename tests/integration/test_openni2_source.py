@@ -323,6 +323,23 @@ def test_a_library_without_drivers_says_where_they_belong(tmp_path: Path) -> Non
     assert "OpenNI2/Drivers" in told
 
 
+PLAY_DUMMY = """
+from rig_agent.sources.openni2 import Openni2Settings, Openni2Source
+for _ in range(3):
+    with Openni2Source(Openni2Settings(uri="Dummy")) as source:
+        frame = source.read(3.0)
+        print(frame.depth_mm.shape, frame.color.shape, source.describe().model.color.fx)
+"""
+
+
+def test_a_driver_that_leaves_a_thread_behind_does_not_crash_the_agent() -> None:
+    """OpenNI2's own Dummy; its images are half as large, and so is the default focal length."""
+    if not any(Path("/usr/lib").glob("*/OpenNI2/Drivers/libDummyDevice.so.0")):
+        pytest.skip("this OpenNI2 brings no Dummy driver: apt install libopenni2-0")
+    redist()
+    assert run_in_child(PLAY_DUMMY).split("\n")[:3] == ["(240, 320) (240, 320, 3) 262.5"] * 3
+
+
 def test_the_systems_library_needs_no_setting(tmp_path: Path) -> None:
     redist()
     assert tmp_path.exists()

@@ -69,6 +69,14 @@ def test_a_property_without_a_proper_name_is_refused(wrong: bytes) -> None:
         check(whole_recording().replace(b"xnIsGenerating", wrong))
 
 
+@pytest.mark.parametrize("streams", [1, 2**32 - 1])
+def test_a_recording_that_misstates_its_streams_is_refused(streams: int) -> None:
+    """OpenNI2's player makes room for as many as stated, and looks for all others beyond it."""
+    whole = whole_recording()
+    with pytest.raises(DataError, match="is torn or damaged"):
+        check(whole[:20] + streams.to_bytes(4, "little") + whole[24:])
+
+
 def test_an_uncompressed_image_of_another_size_than_stated_is_refused() -> None:
     whole = whole_recording()
     stated = b"oniRequiredFrameSize\0\x08\0\0\0"

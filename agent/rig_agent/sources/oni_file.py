@@ -14,7 +14,8 @@ from typing import BinaryIO, NamedTuple
 
 from rig_protocol.errors import ConfigurationError, DataError
 
-_FILE_HEADER_BYTES = 24
+_FILE_HEADER = struct.Struct("<4s16xI")  # ..., the highest number of a stream
+_MOST_STREAMS = 64  # the player makes room for as many as the header says
 _FILE_MAGIC = b"NI10"
 _HEADER = struct.Struct("<4sIIIIQ")
 _MAGIC = b"NIR\0"
@@ -37,6 +38,7 @@ class _Record(NamedTuple):
 class _Contents:
     """What the records so far say."""
 
+    streams: int
     images: int = 0
     uncompressed: set[int] = field(default_factory=set)
     frame_bytes: dict[int, int] = field(default_factory=dict)
@@ -52,10 +54,11 @@ def check_recording(path: Path) -> None:
 
 
 def _check(path: Path, file: BinaryIO) -> None:
-    if not file.read(_FILE_HEADER_BYTES).startswith(_FILE_MAGIC):
+    header = file.read(_FILE_HEADER.size)
+    if len(header) < _FILE_HEADER.size or not header.startswith(_FILE_MAGIC):
         raise DataError(f"{path} is no OpenNI recording: it does not begin with {_FILE_MAGIC.decode()}")
+    contents = _Contents(streams=_FILE_HEADER.unpack(header)[1])
     length = os.fstat(file.fileno()).st_size
-    contents = _Contents()
     while True:
         position = file.tell()
         record = _next_record(file, length)
@@ -88,6 +91,8 @@ def _next_record(file: BinaryIO, length: int) -> _Record | None:
 
 def _takes(contents: _Contents, record: _Record) -> bool:
     """Note what the record says; False when it contradicts itself or what was said before."""
+    if record.stream > contents.streams or contents.streams > _MOST_STREAMS:
+        return False
     if record.kind in _PROPERTIES:
         read = _property(record.fields)
         if read and read[0] == _FRAME_SIZE:

@@ -64,9 +64,13 @@ class Openni2Source:
             check_recording(settings.recording)
         self._settings = settings
         self._gone = threading.Event()
+        self._streaming = False
         self._openni2: ModuleType | None = initialise(settings.redist)
         try:
             self._device = self._open(self._openni2)
+            self._description = _describe(self._device)
+            self._device.start()
+            self._streaming = True
         except self._openni2.OpenNIError as error:
             self.close()
             raise self._failure(f"it cannot be set up: {reason(error)}") from error
@@ -74,20 +78,12 @@ class Openni2Source:
             self.close()
             raise
         self._pairer = FramePairer()
-        self._unit = TimestampUnit(self._device.fps)
+        self._unit = TimestampUnit(self._description.fps)
         self._clock = DeviceClock()
-        self._playback = PlaybackClock(self._device.fps, time.monotonic_ns)
+        self._playback = PlaybackClock(self._description.fps, time.monotonic_ns)
         self._waiting: RgbdFrame | None = None
         self._silent_s = 0.0  # spent in waiting since the last frame
         self._sequence = self._overrun = self._last_index = 0
-        self._description = SourceDescription(
-            serial=self._device.serial,
-            port_path=None,
-            model=self._device.camera_model(),
-            fps=self._device.fps,
-            color_image=self._device.color_image,
-            depth_image="depth_mm" if "depth" in self._device.streams else None,
-        )
         log.info("%s streams; OpenNI2 cannot tell which frames lost packets", self._device.uri)
 
     @property
@@ -122,8 +118,11 @@ class Openni2Source:
     def close(self) -> None:
         """Release the device and shut OpenNI2 down; harmless when already closed."""
         openni2, self._openni2 = self._openni2, None
-        if openni2 is not None:
-            openni2.unload()  # closes streams, listener and device
+        if openni2 is None:
+            return
+        if self._streaming:
+            self._device.stop()
+        openni2.unload()  # closes streams, listener and device
 
     def __enter__(self) -> Self:
         """The source itself."""
@@ -144,7 +143,6 @@ class Openni2Source:
         device = OpenniDevice(openni2, opened, settings.registered)
         if settings.recording is None:
             self._listener = watch(openni2, device.uri, self._gone)
-        device.start()
         return device
 
     def _collect(self, wait_s: float) -> RgbdFrame | None:
@@ -212,3 +210,14 @@ class Openni2Source:
             return DataError(f"{self._settings.recording} cannot be played: {what}")
         name = self._settings.uri or self._settings.serial or "the OpenNI2 device"
         return SourceLost(f"{name}: {what}")
+
+
+def _describe(device: OpenniDevice) -> SourceDescription:
+    return SourceDescription(
+        serial=device.serial,
+        port_path=None,
+        model=device.camera_model(),
+        fps=device.fps,
+        color_image=device.color_image,
+        depth_image="depth_mm" if "depth" in device.streams else None,
+    )

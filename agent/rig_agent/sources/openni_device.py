@@ -28,6 +28,7 @@ _REGISTRATION = 5  # a property of devices
 _MIRRORING = 7  # properties of streams
 _FOV = (1, 2)  # horizontal, vertical
 _AS_FAST_AS_READ = -1.0  # a playback speed
+_LAST_FRAME_S = 0.1  # three frames
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -92,6 +93,16 @@ class OpenniDevice:
         """Images come from now on; OpenNIError when the device does not stream."""
         for stream in self._streams.values():
             stream.start()
+
+    def stop(self) -> None:
+        """Stop the streams, before OpenNI2 is shut down.
+
+        Drivers say that they have stopped while a thread of theirs still works on a frame (Dummy's,
+        FreenectDriver's); what it works on must not be freed before it is done.
+        """
+        for stream in self._streams.values():
+            stream.stop()
+        time.sleep(_LAST_FRAME_S)
 
     def next_image(self, timeout_s: float) -> DeviceImage | None:
         """The next image of any stream, or None; OpenNIError when the device fails."""
@@ -194,20 +205,22 @@ def _intrinsics(openni2: ModuleType, stream: Any | None, otherwise: Intrinsics) 
     mode = stream.get_video_mode()
     width, height = mode.resolutionX, mode.resolutionY
     horizontal, vertical = (_property(openni2, stream, number, ctypes.c_float) or 0.0 for number in _FOV)
-    if not (0 < horizontal < math.pi and 0 < vertical < math.pi):
-        return otherwise
-    fx, fy = width / 2 / math.tan(horizontal / 2), height / 2 / math.tan(vertical / 2)
+    if 0 < horizontal < math.pi and 0 < vertical < math.pi:
+        fx, fy = width / 2 / math.tan(horizontal / 2), height / 2 / math.tan(vertical / 2)
+    else:
+        fx, fy = otherwise.fx * width / otherwise.width, otherwise.fy * height / otherwise.height
     return Intrinsics(fx, fy, (width - 1) / 2, (height - 1) / 2, width, height)
 
 
 def _image(frame: Any, mirrored: bool) -> ImageU8 | ImageU16:
     """A copy of the frame's pixels: depth in millimetres, colour as BGR or grey, not mirrored."""
     pixels = int(frame.videoMode.pixelFormat)
-    size = _BYTES_PER_PIXEL.get(pixels)
-    if size is None or frame.stride < frame.width * size or frame.dataSize < frame.stride * frame.height:
-        raise DataError(f"OpenNI2 delivers a frame of format {pixels} that is shorter than it says")
+    size = _BYTES_PER_PIXEL.get(pixels, 0)
+    row_bytes = frame.width * size
+    if not (0 < row_bytes <= frame.stride and 0 < frame.stride * frame.height <= frame.dataSize):
+        raise DataError(f"OpenNI2 delivers a frame of format {pixels} that is not as large as it says")
     rows = np.frombuffer(frame.get_buffer_as_uint8(), np.uint8, frame.stride * frame.height)
-    packed = rows.reshape(frame.height, frame.stride)[:, : frame.width * size]
+    packed = rows.reshape(frame.height, frame.stride)[:, :row_bytes]
     if pixels == _RGB888:
         color = packed.reshape(frame.height, frame.width, 3)
         return np.asarray(cv2.cvtColor(_upright(color, mirrored), cv2.COLOR_RGB2BGR), np.uint8)

@@ -14,11 +14,13 @@ from rig_protocol.errors import ConfigurationError, DataError, RigError
 
 # The second name comes with the development package alone.
 _LIBRARY_NAMES = ("libOpenNI2.so.0", "libOpenNI2.so")
+_DRIVERS = "/OpenNI2/Drivers/"
 _SERIAL_PROPERTY = 3
 _SERIAL_BYTES = 256
 
 _loaded_from: str | None = None
 """Folder of the libOpenNI2 that this process has loaded; ctypes cannot unload it."""
+_drivers: dict[str, ctypes.CDLL] = {}
 
 
 def initialise(redist: Path | None) -> ModuleType:
@@ -38,6 +40,7 @@ def initialise(redist: Path | None) -> ModuleType:
             f"OpenNI2 does not start ({reason(error)}): libOpenNI2 needs its drivers in OpenNI2/Drivers "
             "beside it; apt install libopenni2-0, or give the folder of both as `redist` in [openni2]"
         ) from error
+    _keep_drivers_loaded()
     return openni2
 
 
@@ -120,6 +123,14 @@ def _load(openni2: Any, redist: Path | None) -> None:
         f"libOpenNI2 cannot be loaded ({reasons[0]}): apt install libopenni2-0, "
         "or give its folder as `redist` in [openni2]"
     )
+
+
+def _keep_drivers_loaded() -> None:
+    """Hold on to every driver: OpenNI2 unloads them, and each time OniFile's is loaded it leaks 9 KiB."""
+    for line in Path("/proc/self/maps").read_text().splitlines():
+        path = line.split(maxsplit=5)[-1]
+        if _DRIVERS in path and path not in _drivers:
+            _drivers[path] = ctypes.CDLL(path)
 
 
 def _open(openni2: ModuleType, uri: str, present: list[str]) -> Any:
