@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from rig_agent.sources.base import SourceLost
+from rig_agent.sources.base import ControlRefused, SourceLost
 from rig_agent.sources.openni2 import Openni2Settings, Openni2Source
 from rig_protocol.errors import ConfigurationError, RigError
 from rig_protocol.frames import RgbdFrame
@@ -271,6 +271,14 @@ def test_thirty_plugs_and_unplugs_leak_no_thread_descriptor_or_device(
     assert held() <= before
     assert device.log().count("open") == device.log().count("close") == 31
     assert threading.active_count() <= before[0]
+
+
+def test_a_control_is_refused_and_harms_nothing(openni_devices: VirtualDevices) -> None:
+    openni_devices.add()
+    with open_source() as source:
+        with pytest.raises(ControlRefused, match="cannot set led to red"):
+            source.control("led", "red")
+        index_of(next_frame(source))
 
 
 def test_reading_a_closed_source_is_a_loss_and_closing_twice_is_harmless(

@@ -4,6 +4,7 @@ import ctypes
 import importlib.metadata
 import platform
 import re
+from pathlib import Path
 
 from rig_agent.config import AgentSettings
 from rig_agent.doctor.finding import Check, Finding, failed, ok
@@ -12,7 +13,6 @@ from rig_protocol.errors import ConfigurationError
 from rig_protocol.troubleshooting import Topic
 
 _DISTRIBUTION = "kinect-rig"
-_OPENNI2_SOURCES: frozenset[str] = frozenset({"openni2"})
 _OPENNI2_NAMES = ("libOpenNI2.so.0", "libOpenNI2.so")
 _OF_ALL = re.compile(r"([A-Za-z0-9._-]+)[^;]*(?:;\s*extra == ['\"]agent['\"])?$")
 
@@ -28,8 +28,8 @@ def libraries(machine: Machine, settings: AgentSettings) -> list[Finding]:
     found = [_python()]
     if settings.source == "freenect":
         found += [_libusb(machine), _libfreenect(machine, settings)]
-    if settings.source in _OPENNI2_SOURCES:
-        found.append(_openni2(machine))
+    if settings.source == "openni2":
+        found.append(_openni2(machine, settings))
     return found
 
 
@@ -83,11 +83,16 @@ def _libfreenect(machine: Machine, settings: AgentSettings) -> Finding:
     return ok(Check.LIBFREENECT, f"libfreenect {version} at {path}")
 
 
-def _openni2(machine: Machine) -> Finding:
-    reasons = []
+def _openni2(machine: Machine, settings: AgentSettings) -> Finding:
+    if not _is_installed("openni"):
+        mend = "sudo /opt/kinect-rig/bin/pip install 'kinect-rig[openni]'"
+        return failed(
+            Check.OPENNI2, "the Python package openni is not installed", mend, Topic.MISSING_LIBRARY
+        )
+    folder, reasons = settings.openni2.redist or Path(), []
     for name in _OPENNI2_NAMES:
         try:
-            machine.load_library(name)
+            machine.load_library(str(folder / name))
         except OSError as error:
             reasons.append(str(error))
         else:

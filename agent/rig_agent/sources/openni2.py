@@ -14,7 +14,7 @@ from typing import Literal, Self, cast
 
 from pydantic import Field
 
-from rig_agent.sources.base import SourceDescription, SourceLost
+from rig_agent.sources.base import ControlRefused, ControlValue, SourceDescription, SourceLost
 from rig_agent.sources.device_clock import DeviceClock
 from rig_agent.sources.frame_pairing import FramePairer, StreamImage
 from rig_agent.sources.oni_file import check_recording
@@ -24,6 +24,7 @@ from rig_agent.sources.openni_time import PlaybackClock, TimestampUnit
 from rig_protocol.errors import ConfigurationError, DataError
 from rig_protocol.frames import ImageU8, ImageU16, RgbdFrame
 from rig_protocol.settings import Settings
+from rig_protocol.troubleshooting import Topic
 
 _POLL_S = 0.1  # how soon a device that goes is noticed
 
@@ -115,6 +116,10 @@ class Openni2Source:
         frame, self._waiting = self._waiting, None
         return frame
 
+    def control(self, name: str, value: ControlValue) -> str:
+        """There is nothing to set: ControlRefused."""
+        raise ControlRefused(f"the openni2 source cannot set {name} to {value}")
+
     def close(self) -> None:
         """Release the device and shut OpenNI2 down; harmless when already closed."""
         openni2, self._openni2 = self._openni2, None
@@ -148,7 +153,8 @@ class Openni2Source:
     def _collect(self, wait_s: float) -> RgbdFrame | None:
         """The frame that the next image completes, if one comes and does."""
         if self._openni2 is None or self._gone.is_set():
-            raise self._failure("it is gone (cable or power?)" if self._openni2 else "it is closed")
+            what = "it is gone (cable or power?)" if self._openni2 else "it is closed"
+            raise self._failure(what, Topic.NO_KINECT)
         try:
             arrived = self._device.next_image(wait_s)
         except self._openni2.OpenNIError as error:
@@ -204,12 +210,12 @@ class Openni2Source:
             time.sleep(min(wait_s, max(end_s - time.monotonic(), 0.0)))
         return self._waiting.timestamp_ns <= time.monotonic_ns()
 
-    def _failure(self, what: str) -> SourceLost | DataError:
+    def _failure(self, what: str, topic: Topic = Topic.NO_FRAMES) -> SourceLost | DataError:
         """A device may come back; a recording does not mend."""
         if self._settings.recording is not None:
             return DataError(f"{self._settings.recording} cannot be played: {what}")
         name = self._settings.uri or self._settings.serial or "the OpenNI2 device"
-        return SourceLost(f"{name}: {what}")
+        return SourceLost(f"{name}: {what}", topic)
 
 
 def _describe(device: OpenniDevice) -> SourceDescription:

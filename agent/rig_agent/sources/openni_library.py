@@ -11,6 +11,7 @@ from typing import Any
 
 from rig_agent.sources.base import SourceLost
 from rig_protocol.errors import ConfigurationError, DataError, RigError
+from rig_protocol.troubleshooting import Topic
 
 # The second name comes with the development package alone.
 _LIBRARY_NAMES = ("libOpenNI2.so.0", "libOpenNI2.so")
@@ -38,7 +39,8 @@ def initialise(redist: Path | None) -> ModuleType:
     except openni2.OpenNIError as error:
         raise ConfigurationError(
             f"OpenNI2 does not start ({reason(error)}): libOpenNI2 needs its drivers in OpenNI2/Drivers "
-            "beside it; apt install libopenni2-0, or give the folder of both as `redist` in [openni2]"
+            "beside it; apt install libopenni2-0, or give the folder of both as `redist` in [openni2]",
+            Topic.MISSING_LIBRARY,
         ) from error
     _keep_drivers_loaded()
     return openni2
@@ -63,7 +65,8 @@ def open_device(openni2: ModuleType, uri: str | None, serial: str | None) -> Any
     if not present:
         raise SourceLost(
             "OpenNI2 sees no device: check cable and power, and that OpenNI2/Drivers holds its driver "
-            "(for a Kinect, libfreenect's FreenectDriver)"
+            "(for a Kinect, libfreenect's FreenectDriver)",
+            Topic.NO_KINECT,
         )
     if serial is not None:
         return _open_by_serial(openni2, serial, present)
@@ -94,7 +97,8 @@ def _package() -> ModuleType:
         from openni import openni2
     except ImportError as error:
         raise ConfigurationError(
-            "source openni2 needs the Python package openni: pip install 'kinect-rig[openni]'"
+            "source openni2 needs the Python package openni: pip install 'kinect-rig[openni]'",
+            Topic.MISSING_LIBRARY,
         ) from error
     module: ModuleType = openni2
     return module
@@ -121,7 +125,8 @@ def _load(openni2: Any, redist: Path | None) -> None:
             return
     raise ConfigurationError(
         f"libOpenNI2 cannot be loaded ({reasons[0]}): apt install libopenni2-0, "
-        "or give its folder as `redist` in [openni2]"
+        "or give its folder as `redist` in [openni2]",
+        Topic.MISSING_LIBRARY,
     )
 
 
@@ -139,10 +144,12 @@ def _open(openni2: ModuleType, uri: str, present: list[str]) -> Any:
     except openni2.OpenNIError as error:
         if uri not in present:
             raise SourceLost(
-                f"no OpenNI2 device {uri} is connected{_but(present)}: check its cable and power"
+                f"no OpenNI2 device {uri} is connected{_but(present)}: check its cable and power",
+                Topic.NO_KINECT,
             ) from error
         raise SourceLost(
-            f"{uri} cannot be opened ({reason(error)}): does another program use it, may this user?"
+            f"{uri} cannot be opened ({reason(error)}): does another program use it, may this user?",
+            Topic.KINECT_IN_USE,
         ) from error
 
 
@@ -160,7 +167,9 @@ def _open_by_serial(openni2: ModuleType, serial: str, present: list[str]) -> Any
             return device
         device.close()
         told.append(f"{uri} ({found or 'tells no serial number: choose it by `uri`'})")
-    raise SourceLost(f"no OpenNI2 device {serial} is connected{_but(told)}: check its cable and power")
+    raise SourceLost(
+        f"no OpenNI2 device {serial} is connected{_but(told)}: check its cable and power", Topic.NO_KINECT
+    )
 
 
 def _but(present: list[str]) -> str:
