@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from rig_protocol.errors import ConfigurationError
-from rig_protocol.programs import leave_done, run_program, set_up_logging
+from rig_protocol.programs import EXIT_FAILED, leave_done, run_program, set_up_logging
 
 if TYPE_CHECKING:  # heavy: imported where they are used, so that --help is quick
     from rig_agent.config import AgentSettings
@@ -19,9 +19,13 @@ _EXAMPLES = """
 
 `rig-agent --server 10.0.0.1` — a Kinect on this Pi, to a server there
 
+`rig-agent --source openni2 --recording office.oni --camera 2` — play an OpenNI2 recording
+
 `rig-agent --source folder --path recordings/office --camera 3` — play camera 3 of a rig folder
 
 `rig-agent --source synthetic --camera 0 --seed 7` — one camera of the simulated ring
+
+`rig-agent --check` — what keeps this machine from streaming, and what mends it
 
 `rig-agent init` — write ./agent.toml, every option explained, then edit it and run `rig-agent`
 
@@ -46,7 +50,8 @@ def run(
     source: Annotated[
         str | None,
         typer.Option(
-            metavar="NAME", help="freenect (a Kinect), folder (a recording) or synthetic (simulated)."
+            metavar="NAME",
+            help="freenect (a Kinect), openni2 (another camera), folder (recorded), synthetic (simulated).",
         ),
     ] = None,
     server: Annotated[
@@ -57,6 +62,9 @@ def run(
         typer.Option(metavar="ID", help="Slot in the ring; with a folder, an id or name of nominal.json."),
     ] = None,
     path: Annotated[Path | None, typer.Option(help="The rig folder to play (source folder).")] = None,
+    recording: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="The .oni recording to play (source openni2).")
+    ] = None,
     fps: Annotated[float | None, typer.Option(help="Frames a second.")] = None,
     seed: Annotated[int | None, typer.Option(help="Seed of the simulated rig (source synthetic).")] = None,
     cameras: Annotated[
@@ -75,6 +83,11 @@ def run(
     print_config: Annotated[
         bool, typer.Option("--print-config", help="Print the effective settings as TOML and exit.")
     ] = False,
+    check: Annotated[
+        bool,
+        typer.Option("--check", help="Look at Kinect, machine, network and server, say what mends, exit."),
+    ] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="With --check: JSON and nothing else.")] = False,
 ) -> None:
     """Stream one camera, colour and depth, to the rig server until stopped.
 
@@ -94,18 +107,27 @@ def run(
         "fps": fps,
         "key_file": key_file,
         "insecure": insecure or None,
+        "openni2": {"recording": recording},
         "folder": {"path": path, "camera": name},
         "synthetic": {"seed": seed, "cameras": cameras},
     }
     settings = load_agent_settings(config, overrides)
     _refuse_options_of_another_source(
         settings.source,
-        {"--path": path, "--camera NAME": name},
-        {"--seed": seed, "--cameras": cameras, "--truth-out": truth_out},
+        {
+            "openni2": {"--recording": recording},
+            "folder": {"--path": path, "--camera NAME": name},
+            "synthetic": {"--seed": seed, "--cameras": cameras, "--truth-out": truth_out},
+        },
     )
     if print_config:
         typer.echo(effective_toml(settings), nl=False)
         return
+    if check:
+        _check(settings, as_json)
+        return
+    if as_json:
+        raise ConfigurationError("--json belongs to --check")
     set_up_logging(settings.log_level)
     if truth_out is not None:
         _write_truth(truth_out, settings)
@@ -149,6 +171,25 @@ def _stream(settings: "AgentSettings") -> None:
         os.execv(sys.executable, [sys.executable, *sys.orig_argv[1:]])  # noqa: S606  # our own command line
 
 
+def _check(settings: "AgentSettings", as_json: bool) -> None:
+    """Print the doctor's findings; exit status 1 when one of them is `failed`."""
+    from rich.console import Console
+
+    from rig_agent.doctor.examination import examine
+    from rig_agent.doctor.machine import Machine
+    from rig_agent.doctor.report import passed, print_finding, summary, to_json
+
+    set_up_logging("CRITICAL")  # what the drivers would log is in the findings
+    console, findings = Console(highlight=False), []
+    for finding in examine(Machine(), settings):
+        findings.append(finding)
+        if not as_json:
+            print_finding(console, finding)
+    typer.echo(to_json(findings, settings.source) if as_json else summary(findings))
+    if not passed(findings):
+        raise typer.Exit(EXIT_FAILED)
+
+
 def _on_signals(action: Any) -> None:
     for number in (signal.SIGTERM, signal.SIGINT):
         signal.signal(number, action)
@@ -171,9 +212,9 @@ def _slot_or_name(camera: str | None) -> tuple[int | None, str | None]:
     return None, camera
 
 
-def _refuse_options_of_another_source(source: str, folder: dict[str, Any], synthetic: dict[str, Any]) -> None:
+def _refuse_options_of_another_source(source: str, owned: dict[str, dict[str, Any]]) -> None:
     """ConfigurationError for an option that the chosen source would silently ignore."""
-    for owner, options in (("folder", folder), ("synthetic", synthetic)):
+    for owner, options in owned.items():
         for option, value in options.items():
             if value is not None and source != owner:
                 raise ConfigurationError(f"{option} belongs to --source {owner}, but the source is {source}")

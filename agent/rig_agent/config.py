@@ -9,6 +9,7 @@ from pydantic import Field, field_validator
 
 from rig_agent.simulator.settings import SimulatorSettings
 from rig_agent.sources.freenect import FreenectSettings
+from rig_agent.sources.openni2 import Openni2Settings
 from rig_protocol.datagram import DEFAULT_DATAGRAM_SIZE, MAX_DATAGRAM_SIZE, MIN_DATAGRAM_SIZE
 from rig_protocol.events import Address
 from rig_protocol.settings import Settings, load_settings
@@ -18,7 +19,7 @@ CONFIG_PLACES = (Path("agent.toml"), Path("/etc/kinect-rig/agent.toml"))
 DEFAULT_PORT = 4012
 AUTO = "auto"
 
-SourceName = Literal["freenect", "folder", "synthetic"]
+SourceName = Literal["freenect", "openni2", "folder", "synthetic"]
 Manner = Literal["lossless", "jpeg", "raw"]
 """How images travel: losslessly compressed, as JPEG, uncompressed."""
 
@@ -47,7 +48,7 @@ class AgentSettings(Settings):
     server: str = Field(AUTO, examples=["rig-server.local:4012"])
     """Where rig-server listens: HOST:PORT or HOST; `auto`: where one announces itself by mDNS."""
     source: SourceName = "freenect"
-    """Where frames come from: a Kinect, a recorded rig folder or the simulator."""
+    """Where frames come from: a Kinect, any OpenNI2 device or recording, a rig folder or the simulator."""
     camera: int | None = Field(None, ge=0, lt=64, examples=[0])
     """Slot of this camera in the ring; unset: the server knows it by serial number or USB port."""
     name: str | None = Field(None, pattern=r"^[A-Za-z0-9][A-Za-z0-9_.-]{0,63}$", examples=["cam00"])
@@ -72,6 +73,8 @@ class AgentSettings(Settings):
     """How frames are spread in time."""
     freenect: FreenectSettings = FreenectSettings()
     """Options of `source = "freenect"`: which Kinect."""
+    openni2: Openni2Settings = Openni2Settings()
+    """Options of `source = "openni2"`: which device or recording."""
     folder: FolderSettings = FolderSettings()
     """Options of `source = "folder"`."""
     synthetic: SimulatorSettings = SimulatorSettings()

@@ -1,5 +1,6 @@
 """Servers that announce themselves by mDNS: where an agent without a server's address looks for one."""
 
+import contextlib
 import ipaddress
 import logging
 import threading
@@ -7,6 +8,7 @@ import time
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
+from rig_agent.config import AgentSettings
 from rig_protocol.datagram import SERVICE_TYPE
 from rig_protocol.events import Address
 
@@ -18,6 +20,7 @@ _log = logging.getLogger(__name__)
 _MAX_SERVERS = 16  # anybody may announce one
 _MAX_ADDRESSES = 8  # of one server
 _RESOLVE_MS = 3000
+_LOOK_AGAIN_S = 0.1
 # Interfaces that came up since we began are not listened on: begin anew while nobody is heard.
 _BEGIN_ANEW_S = 20.0
 
@@ -87,6 +90,20 @@ class ServerFinder:
             if info is not None and info.port and len(self._servers) < _MAX_SERVERS:
                 found = info.parsed_addresses()[:_MAX_ADDRESSES]
                 self._servers[name] = [(address, info.port) for address in found]
+
+
+def located(settings: AgentSettings, patience_s: float) -> AgentSettings:
+    """The same with the address of a server that announces itself, where the settings leave it to that.
+
+    Unchanged where none is heard in time.
+    """
+    if settings.address is not None:
+        return settings
+    with contextlib.closing(ServerFinder()) as finder:
+        until_s = time.monotonic() + patience_s
+        while (found := finder.next_address()) is None and time.monotonic() < until_s:
+            time.sleep(_LOOK_AGAIN_S)
+    return settings if found is None else settings.model_copy(update={"server": "{}:{}".format(*found)})
 
 
 def _is_near(host: str) -> bool:

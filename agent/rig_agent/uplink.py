@@ -18,6 +18,7 @@ from rig_protocol.gravity import Gravity
 from rig_protocol.messages import Hello, StreamPlan, Welcome
 from rig_protocol.rig_key import RigKey
 from rig_protocol.system_clock import SystemClockReading
+from rig_protocol.troubleshooting import Topic, see
 
 _log = logging.getLogger(__name__)
 
@@ -238,12 +239,14 @@ class Uplink:
                         self._transport.server,
                         reason.name,
                         text,
+                        extra=see(Topic.AGENT_REFUSED),
                     )
                 self._refusal = text
             case Disconnected(text):
                 self._pacer.clear()
                 self._news.append(event)
-                _log.warning("lost %s: %s; trying on", self._transport.server, text)
+                server = self._transport.server
+                _log.warning("lost %s: %s; trying on", server, text, extra=see(Topic.SERVER_SILENT))
             case ControlRequested():
                 self._news.append(event)
 

@@ -95,6 +95,11 @@ class AgentProcess:
             self.kill()
             raise
 
+    def wait(self, timeout_s: float = START_TIMEOUT_S) -> int:
+        """Until it ends by itself; the exit status."""
+        assert self._process is not None
+        return self._process.wait(timeout_s)
+
     @property
     def log(self) -> str:
         """What it printed so far."""

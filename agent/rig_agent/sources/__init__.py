@@ -22,6 +22,12 @@ def _open_freenect(settings: "AgentSettings") -> "FrameSource":
     return FreenectSource(settings.freenect)
 
 
+def _open_openni2(settings: "AgentSettings") -> "FrameSource":
+    from rig_agent.sources.openni2 import Openni2Source
+
+    return Openni2Source(settings.openni2)
+
+
 def _open_folder(settings: "AgentSettings") -> "FrameSource":
     from rig_agent.sources.folder import FolderSource
 
@@ -40,4 +46,9 @@ def _open_synthetic(settings: "AgentSettings") -> "FrameSource":
     return SyntheticSource(settings.synthetic.model_copy(update={"fps": fps}), settings.camera or 0)
 
 
-_OPENERS = {"freenect": _open_freenect, "folder": _open_folder, "synthetic": _open_synthetic}
+_OPENERS = {
+    "freenect": _open_freenect,
+    "openni2": _open_openni2,
+    "folder": _open_folder,
+    "synthetic": _open_synthetic,
+}

@@ -25,6 +25,7 @@ from rig_agent.usb.accelerometer import Accelerometer
 from rig_protocol.errors import RigError
 from rig_protocol.frames import ImageU8, ImageU16, RgbdFrame
 from rig_protocol.settings import Settings
+from rig_protocol.troubleshooting import Topic
 
 FPS = 30.0
 _STOP_LIMIT_S = 2.0  # stopping takes one poll of 0.1 s and a few commands
@@ -59,7 +60,10 @@ class FreenectSource:
         """
         _hanging[:] = [thread for thread in _hanging if not thread.stop(0)]
         if _hanging:
-            raise RigError("libfreenect hangs in a Kinect that stopped answering: start the agent anew")
+            raise RigError(
+                "libfreenect hangs in a Kinect that stopped answering: start the agent anew",
+                Topic.HANGING_KINECT,
+            )
         library = load_libfreenect(settings.library)
         self._timeout_s = settings.timeout_s
         self._camera, motor = _find(settings)
@@ -108,7 +112,7 @@ class FreenectSource:
         try:
             pair = self._thread.next_pair(timeout_s)
         except SourceLost as error:
-            raise SourceLost(f"{self._camera} is gone (cable or power?): {error}") from error
+            raise SourceLost(f"{self._camera} is gone (cable or power?): {error}", Topic.NO_KINECT) from error
         now_s = time.monotonic()
         if pair is not None:
             self._last_pair_s = now_s
