@@ -154,7 +154,7 @@ class Transport:
         if found is not None:
             self._server = found
         elif self._last_error != _NOBODY:
-            _log.warning("%s; trying on", _NOBODY)
+            _log.warning("%s; trying on", _NOBODY, extra=see(Topic.SERVER_SILENT))
             self._last_error = _NOBODY
         return found is not None
 

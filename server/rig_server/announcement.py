@@ -13,6 +13,7 @@ from collections.abc import Iterator, Sequence
 
 from rig_protocol.datagram import SERVICE_TYPE, VERSION
 from rig_protocol.events import Address
+from rig_protocol.troubleshooting import Topic, see
 
 logger = logging.getLogger(__name__)
 
@@ -33,7 +34,7 @@ def announced(address: Address, interfaces: Sequence[str] | None = None) -> Iter
     try:
         zeroconf = Zeroconf(InterfaceChoice.All if interfaces is None else list(interfaces))
     except (OSError, RuntimeError) as error:
-        logger.warning("agents cannot find this server by mDNS (%s): give them its address", error)
+        _tell_failure(error)
         yield
         return
     name = platform.node().partition(".")[0] or "rig-server"
@@ -49,8 +50,13 @@ def announced(address: Address, interfaces: Sequence[str] | None = None) -> Iter
         try:
             zeroconf.register_service(service, allow_name_change=True)
         except (OSError, ZeroconfError) as error:
-            logger.warning("agents cannot find this server by mDNS (%r): give them its address", error)
+            _tell_failure(error)
         yield
+
+
+def _tell_failure(error: Exception) -> None:
+    text = "agents cannot find this server by mDNS (%r): give them its address"
+    logger.warning(text, error, extra=see(Topic.NO_NETWORK))
 
 
 def _reachable(host: str) -> list[str]:

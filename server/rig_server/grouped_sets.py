@@ -15,6 +15,7 @@ from rig_protocol.errors import RigError
 from rig_protocol.events import Outcome
 from rig_protocol.frames import PanoramicFrame, RgbdFrame
 from rig_protocol.rig_folder import RigDescription
+from rig_protocol.troubleshooting import Topic
 from rig_server.config import CaptureSettings
 from rig_server.projector_groups import Groups, assign_groups
 from rig_server.receiver import rig_time_ns
@@ -147,7 +148,8 @@ class GroupedSets:
             if refused:
                 raise RigError(
                     "not every camera can switch its depth: " + "; ".join(refused) + ". Calibrate without "
-                    "--projector-groups, or mend it"
+                    "--projector-groups, or mend it",
+                    Topic.CALIBRATION_REFUSED,
                 )
             if on:
                 self._on |= cameras

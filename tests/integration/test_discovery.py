@@ -1,5 +1,6 @@
 """Rules of discovery: agents find a server that announces itself, on real multicast of loopback."""
 
+import secrets
 import socket
 import time
 from collections.abc import Iterator
@@ -29,6 +30,14 @@ def _multicast() -> None:
             probe.sendto(b"", ("224.0.0.251", 5353))
     except OSError as error:
         pytest.skip(f"loopback carries no multicast here ({error}): ip route add 224.0.0.0/4 dev lo")
+
+
+@pytest.fixture(autouse=True)
+def _kind_of_our_own(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Loopback's multicast reaches every process of this machine: other tests must not be found."""
+    kind = f"_kr{secrets.token_hex(5)}._udp.local."
+    monkeypatch.setattr("rig_agent.discovery.SERVICE_TYPE", kind)
+    monkeypatch.setattr("rig_server.announcement.SERVICE_TYPE", kind)
 
 
 @pytest.fixture

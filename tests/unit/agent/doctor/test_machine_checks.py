@@ -167,6 +167,15 @@ def test_a_server_name_that_nobody_knows_fails(pi: PiTree, monkeypatch: pytest.M
     assert "no-such-rig.invalid" in finding.text
 
 
+def test_a_server_that_is_to_be_found_and_does_not_announce_itself_fails_with_what_to_look_at(
+    pi: PiTree,
+) -> None:
+    finding = verdict(pi.machine(), network, Check.SERVER_NAME, AgentSettings(server="auto"))
+    assert finding.status is Status.FAILED
+    assert "announced itself" in finding.text
+    assert "announce" in (finding.mend or "")
+
+
 def test_libraries_that_are_missing_name_their_package(pi: PiTree) -> None:
     def absent_driver(*_: Any) -> Any:
         raise ConfigurationError("libfreenect cannot be loaded")
