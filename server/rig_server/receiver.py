@@ -100,7 +100,6 @@ class Receiver:
         self._buffer = bytearray(_MAX_RECEIVE)
         self._gatherer = Gatherer()
         self._wake_receiver, self._waker = socket.socketpair()
-        self._wake_receiver.setblocking(False)
         self._posted: deque[Callable[[int], None]] = deque()
         self._stopping = threading.Event()
         self._thread = threading.Thread(target=self._run, name="receiver", daemon=True)
@@ -147,7 +146,9 @@ class Receiver:
         try:
             emptied = True
             while not self._stopping.is_set():
-                poller.poll(self._timeout_ms())
+                ready = poller.poll(self._timeout_ms())
+                if any(fd == self._wake_receiver.fileno() for fd, _ in ready):
+                    self._wake_receiver.recv(_MAX_RECEIVE)  # then do what was posted: none is missed
                 if emptied:
                     time.sleep(_TURN_S)
                 emptied = self._receive_some()
@@ -201,14 +202,9 @@ class Receiver:
             self._link.receive_batch(batch, sender, rig_time_ns())
             self._deliver_events()
 
-    def _do_posted(self) -> None:
-        with contextlib.suppress(BlockingIOError):
-            self._wake_receiver.recv(_MAX_RECEIVE)
+    def _serve_link(self) -> None:
         while self._posted:
             self._posted.popleft()(rig_time_ns())
-
-    def _serve_link(self) -> None:
-        self._do_posted()
         due_ns, now_ns = self._link.next_timeout_ns(), rig_time_ns()
         if due_ns is not None and due_ns <= now_ns:
             self._link.handle_timeout(now_ns)
