@@ -6,12 +6,15 @@ its calls therefore happen on this thread, and everybody else waits for it with 
 
 import ctypes
 import logging
+import queue
 import threading
 from collections import deque
+from collections.abc import Callable
+from concurrent.futures import Future
 
 from rig_agent.sources.base import SourceLost
 from rig_agent.sources.frame_pairing import FramePairer, ImagePair, StreamImage
-from rig_agent.sources.freenect_device import FreenectDevice
+from rig_agent.sources.freenect_device import FreenectDevice, Switches
 from rig_agent.sources.libfreenect import ZeroPlane
 from rig_protocol.errors import RigError
 
@@ -26,7 +29,7 @@ log = logging.getLogger(__name__)
 class FreenectThread:
     """Opens the `index`-th Kinect on a thread of its own and streams until stopped or lost."""
 
-    def __init__(self, library: ctypes.CDLL, index: int) -> None:
+    def __init__(self, library: ctypes.CDLL, index: int, switches: Switches) -> None:
         """Start the thread; `wait_until_open` says how it went."""
         self._changed = threading.Condition()
         self._pairs: deque[ImagePair] = deque()
@@ -37,8 +40,11 @@ class FreenectThread:
         self._stopping = False
         self._overrun = 0
         self._device: FreenectDevice | None = None
+        self._orders: queue.SimpleQueue[tuple[Callable[[FreenectDevice], None], Future[None]]] = (
+            queue.SimpleQueue()
+        )
         self._thread = threading.Thread(
-            target=self._run, args=(library, index), name="freenect", daemon=True
+            target=self._run, args=(library, index, switches), name="freenect", daemon=True
         )  # a daemon, because a thread that hangs in libfreenect must not keep the program alive
         self._thread.start()
 
@@ -72,34 +78,68 @@ class FreenectThread:
                 raise self._error
             return None
 
+    def switch(self, switches: Switches, timeout_s: float, restart: bool = False) -> None:
+        """Make the streams so, or all of them anew, and forget the images before.
+
+        SourceLost when the device does not come along within the limit.
+        """
+
+        def order(device: FreenectDevice) -> None:
+            (device.restart if restart else device.switch)(switches)
+            self._pairer.start_anew(with_depth=switches.depth is not None)
+            with self._changed:
+                self._pairs.clear()
+
+        self._do(order, timeout_s)
+
     def stop(self, timeout_s: float) -> bool:
         """Ask the thread to close the device; False when it is still in libfreenect after the limit."""
         self._stopping = True
         self._thread.join(timeout_s)
         return not self._thread.is_alive()
 
-    def _run(self, library: ctypes.CDLL, index: int) -> None:
+    def _do(self, order: Callable[[FreenectDevice], None], timeout_s: float) -> None:
+        done: Future[None] = Future()
+        self._orders.put((order, done))
         try:
-            self._stream(library, index)
+            done.result(timeout_s)
+        except TimeoutError as error:
+            raise self._error or SourceLost(f"the camera did not answer within {timeout_s:g} s") from error
+
+    def _run(self, library: ctypes.CDLL, index: int, switches: Switches) -> None:
+        try:
+            self._stream(library, index, switches)
         except RigError as error:
             self._fail(error)
         except Exception as error:  # a thread's last words would otherwise be lost
             log.exception("the thread of libfreenect failed")
             self._fail(RigError(f"the thread of libfreenect failed: {error!r}"))
 
-    def _stream(self, library: ctypes.CDLL, index: int) -> None:
+    def _stream(self, library: ctypes.CDLL, index: int, switches: Switches) -> None:
         device = FreenectDevice(library, index, self._on_image)
         try:
             self._device = device
-            device.start()
+            self._pairer.start_anew(with_depth=switches.depth is not None)
+            device.switch(switches)
             with self._changed:
                 self._zero_plane = device.zero_plane()
                 self._open = True
                 self._changed.notify_all()
             while not self._stopping:
                 device.process(_POLL_S)
+                self._obey(device)
         finally:
             device.close()
+
+    def _obey(self, device: FreenectDevice) -> None:
+        while not self._orders.empty():
+            order, done = self._orders.get()
+            try:
+                order(device)
+            except RigError as error:
+                done.set_exception(error)
+                raise
+            done.set_result(None)
 
     def _on_image(self, image: StreamImage) -> None:
         pair = self._pairer.add(image)

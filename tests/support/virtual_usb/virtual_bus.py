@@ -4,6 +4,8 @@ A bus is a folder with one numbered folder (0 to 7) for each Kinect. In it, the 
     present                            exists while the Kinect is plugged in
     serial, model                      model is 1414, 1473 or k4w
     bayer.bin, depth11.bin             frames, looped: 640×480 GRBG bytes; 640×480 packed 11-bit values
+    ir.bin, bayer_high.bin, ir_high.bin   likewise, where a test wants them: 640×488 packed 10-bit values of
+                                       infrared; 1280×1024 of either, at a third and a fourth of the rate
     accel                              "x y z tilt status" in counts (819 a g)
     first_tick                         the 60-MHz clock at power-on
     deny, busy, mute, stall            faults: no permission; claimed by another program; never answers
