@@ -19,6 +19,11 @@ SERIAL = "A00364A11111111A"
 IMPATIENT = FreenectSettings(timeout_s=0.5)
 
 
+@pytest.fixture(autouse=True)
+def _nothing_untold() -> None:
+    freenect._untold.clear()
+
+
 @pytest.fixture
 def kinect(usb_bus: VirtualBus) -> Iterator[VirtualKinect]:
     kinect = usb_bus.add_kinect(SERIAL)
@@ -100,11 +105,60 @@ def test_a_replug_too_quick_to_see_is_a_loss_too(kinect: VirtualKinect) -> None:
         read_until_lost(source, limit_s=1.0)
 
 
-def test_images_that_stop_coming_are_a_loss_after_the_time_out(kinect: VirtualKinect) -> None:
+def read_until_counted(source: FreenectSource, counter: str, limit_s: float = 5.0) -> None:
+    """Read on until the source has taken this step once."""
+    end_s = time.monotonic() + limit_s
+    while source.counters[counter] == 0:
+        source.read(0.1)
+        assert time.monotonic() < end_s, f"no step {counter} within {limit_s} s"
+
+
+def test_a_silent_kinect_climbs_the_ladder_and_each_step_is_logged_and_counted(
+    kinect: VirtualKinect, caplog: pytest.LogCaptureFixture
+) -> None:
     with FreenectSource(IMPATIENT) as source:
         assert source.read(2.0) is not None
         kinect.write("stall")
-        assert "no images for 0.5 s" in str(read_until_lost(source, limit_s=3.0))
+        with pytest.raises(RigError, match="whatever was tried: start the agent anew") as end:
+            read_until_lost(source, limit_s=15.0)
+        counters = source.counters
+    assert not isinstance(end.value, SourceLost), "trying again in this process cannot help"
+    assert (counters["stream_restarts"], counters["device_restarts"], counters["usb_resets"]) == (1, 1, 1)
+    steps = [record.message for record in caplog.records if "no images for 0.5 s" in record.message]
+    assert [step.split("; ")[1] for step in steps] == [
+        "its streams were restarted",
+        "it was opened anew",
+        "its USB port was reset",
+    ]
+    assert kinect.log().count("reset Xbox NUI Camera") == 1
+    assert kinect.open_handles() == 0
+
+
+def test_a_stream_that_came_back_begins_the_ladder_at_its_foot(kinect: VirtualKinect) -> None:
+    with FreenectSource(IMPATIENT) as source:
+        for restarts in (1, 2):
+            assert source.read(2.0) is not None
+            kinect.write("stall")
+            end_s = time.monotonic() + 5
+            while source.counters["stream_restarts"] < restarts and time.monotonic() < end_s:
+                source.read(0.1)
+            kinect.clear("stall")
+        assert source.read(2.0) is not None
+        assert source.counters["stream_restarts"] == 2
+        assert source.counters["device_restarts"] == 0
+
+
+def test_what_the_operator_set_outlives_the_ladder(kinect: VirtualKinect) -> None:
+    with FreenectSource(IMPATIENT) as source:
+        source.control("depth", False)
+        source.control("mirror", True)
+        kinect.write("stall")
+        read_until_counted(source, "device_restarts")
+        kinect.clear("stall")
+        frame = source.read(2.0)
+        assert frame is not None
+        assert frame.raw is None
+    assert kinect.log().count("register 0047=0001") >= 2, "mirrored after the reopening, too"
 
 
 def test_a_camera_that_never_answers_does_not_hang_opening(kinect: VirtualKinect) -> None:
@@ -116,6 +170,7 @@ def test_a_camera_that_never_answers_does_not_hang_opening(kinect: VirtualKinect
     assert "reset Xbox NUI Camera" in kinect.log()
     with FreenectSource(IMPATIENT) as source:
         assert source.read(2.0) is not None, "the reset did not help"
+        assert source.counters["usb_resets"] == 1, "the source that could not open did not live to tell"
 
 
 def test_a_camera_that_stops_answering_does_not_hang_closing(kinect: VirtualKinect) -> None:

@@ -1,13 +1,10 @@
 """A unit's own depth model from the zero-plane data in its firmware.
 
-It holds the depth camera's focal length, the disparity's scale and how far apart the cameras are. It is silent
-about the colour camera, principal points, distortion and how the cameras are turned. So the model's `source`
-stays "default": calibration must leave all that as wide as for a unit of which nothing is known.
+It holds the depth camera's focal length and the scale of its disparity. It is silent about the colour camera,
+principal points, distortion and how the cameras stand to each other (libfreenect gives 2.4 cm between them,
+whatever the unit says). So the model's `source` stays "default": calibration must leave all that as wide as
+for a unit of which nothing is known.
 """
-
-from dataclasses import replace
-
-import numpy as np
 
 from rig_agent.sources.libfreenect import ZeroPlane
 from rig_protocol.camera import CameraModel, Intrinsics, RawDepthModel
@@ -16,7 +13,6 @@ from rig_protocol.camera import CameraModel, Intrinsics, RawDepthModel
 _PLAUSIBLE_FOCAL_PX = (500.0, 660.0)
 _PLAUSIBLE_NUMERATOR_M = (280.0, 420.0)
 _PLAUSIBLE_OFFSET = (1040.0, 1140.0)
-_PLAUSIBLE_BASELINE_CM = (2.0, 3.0)  # of colour and depth camera
 _SUBPIXEL_STEPS = 4  # raw disparity counts quarters of a zero-plane pixel ...
 _STEP_OFFSET = 0.375  # ... from this rounding offset
 _BINNING = 2  # the zero plane is of the 1280-pixel sensor, images have 640
@@ -41,14 +37,9 @@ def camera_model(zero_plane: ZeroPlane | None) -> CameraModel:
         and _within(offset, _PLAUSIBLE_OFFSET)
     ):
         return CameraModel()
-    model = CameraModel(
+    return CameraModel(
         depth=Intrinsics(focal_px, focal_px, 319.5, 239.5), raw_model=RawDepthModel(numerator_m, offset)
     )
-    if not _within(zero_plane.color_distance_cm, _PLAUSIBLE_BASELINE_CM):
-        return model
-    T_color_depth = np.eye(4)
-    T_color_depth[0, 3] = -zero_plane.color_distance_cm / 100
-    return replace(model, T_color_depth=T_color_depth)
 
 
 def _within(value: float, bounds: tuple[float, float]) -> bool:

@@ -67,7 +67,6 @@ class ZeroPlane(NamedTuple):
     reference_distance_cm: float
     reference_pixel_size_cm: float
     const_shift: float
-    color_distance_cm: float = 0.0
 
 
 FRAME_CALLBACK = c.CFUNCTYPE(None, c.c_void_p, c.c_void_p, c.c_uint32)
@@ -130,7 +129,6 @@ def zero_plane(library: c.CDLL, device: c.c_void_p) -> ZeroPlane | None:
         reference_distance_cm=copy.reference_distance_cm,
         reference_pixel_size_cm=copy.reference_pixel_size_cm,
         const_shift=copy.const_shift,
-        color_distance_cm=copy.color_distance_cm,
     )
 
 

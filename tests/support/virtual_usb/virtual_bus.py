@@ -52,7 +52,7 @@ class KinectFrames:
     @functools.cached_property
     def packed_raw(self) -> bytes:
         """The depth images as the sensor sends them."""
-        return pack_11bit(self.raw)
+        return pack_bits(self.raw, bits=11)
 
     def index_of(self, raw: npt.NDArray[np.uint16]) -> int | None:
         """Which frame this depth image is, byte for byte."""
@@ -68,6 +68,23 @@ def kinect_frames() -> KinectFrames:
     # An even shift keeps the mosaic's phase, and tells the frames apart.
     bayer = [np.roll(_mosaic_grbg(color), 2 * i, axis=1) for i in range(len(raw))]
     return KinectFrames(np.stack(bayer), np.stack(raw).astype(np.uint16))
+
+
+@dataclass(frozen=True)
+class InfraredFrames:
+    """Infrared images that a virtual Kinect loops: ten bits a pixel, the upper eight as given here."""
+
+    grey: npt.NDArray[np.uint8]  # (N,488,640)
+
+    def write(self, kinect: "VirtualKinect") -> None:
+        """Before the Kinect is plugged in."""
+        (kinect.folder / "ir.bin").write_bytes(pack_bits(self.grey.astype(np.uint16) << 2, bits=10))
+
+
+@functools.cache
+def infrared_frames() -> InfraredFrames:
+    """Noise, no two images alike."""
+    return InfraredFrames(np.random.default_rng(0).integers(0, 256, (3, 488, 640), np.uint8))
 
 
 class VirtualKinect:
@@ -171,10 +188,10 @@ def library() -> Path:
     return built
 
 
-def pack_11bit(raw: npt.NDArray[np.uint16]) -> bytes:
-    """As the sensor sends it: 11 bits a pixel, most significant first, no padding."""
-    bits = np.unpackbits(raw.astype(">u2").view(np.uint8).reshape(-1, 2), axis=1)
-    return np.packbits(bits[:, 5:]).tobytes()
+def pack_bits(values: npt.NDArray[np.uint16], bits: int) -> bytes:
+    """As the sensor sends them: so many bits a pixel, most significant first, no padding."""
+    unpacked = np.unpackbits(values.astype(">u2").view(np.uint8).reshape(-1, 2), axis=1)
+    return np.packbits(unpacked[:, 16 - bits :]).tobytes()
 
 
 def _compile(sources: list[Path], include: str, target: Path) -> None:
