@@ -11,6 +11,7 @@ import pytest
 from rig_agent.sources import freenect
 from rig_agent.sources.base import SourceLost
 from rig_agent.sources.freenect import FreenectSettings, FreenectSource
+from rig_agent.sources.freenect_formats import DepthName
 from rig_agent.usb import enumerate as usb_enumerate
 from rig_protocol.errors import ConfigurationError, RigError
 from support.virtual_usb.virtual_bus import VirtualBus, VirtualKinect, kinect_frames
@@ -226,11 +227,14 @@ def test_a_frame_with_a_lost_packet_is_flagged_and_its_neighbours_are_not(
     assert damaged in (5, 6, 7), "every fourth frame lost a packet, no other did"
 
 
-def test_random_packet_loss_never_yields_a_torn_frame_without_flag(kinect: VirtualKinect) -> None:
+@pytest.mark.parametrize("depth_format", ["11bit", "11bit_packed"])
+def test_random_packet_loss_never_yields_a_torn_frame_without_flag(
+    kinect: VirtualKinect, depth_format: DepthName
+) -> None:
     kinect.write("lose", "0.2")
     recorded = kinect_frames()
     whole = 0
-    with FreenectSource(FreenectSettings()) as source:
+    with FreenectSource(FreenectSettings(depth_format=depth_format)) as source:
         for _ in range(60):
             frame = source.read(2.0)
             assert frame is not None

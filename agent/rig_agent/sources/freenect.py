@@ -179,7 +179,7 @@ class FreenectSource:
                 self._motor.set_tilt(tilt_deg)
                 return f"the Kinect turns to {tilt_deg:g} degrees above the horizon"
             case "restart":
-                return self._restart(one_of(RestartStep, name, value))
+                return self._restart("stream" if value is True else one_of(RestartStep, name, value))
         wishes = self._wishes.told(name, value, self._camera.model)
         thread.switch(wishes.switches(self._camera.model), self._settings.timeout_s)
         self._wishes, self._last_sign_s = wishes, time.monotonic()
@@ -216,7 +216,7 @@ class FreenectSource:
         _hanging[:] = [thread for thread in _hanging if not thread.stop(0)]
         if _hanging:
             raise RigError("libfreenect hangs in a Kinect that stopped answering: start the agent anew")
-        self._camera, motor = _find(self._settings)
+        self._camera, motor = find_kinect(self._settings)
         self._motor = Motor(motor)
         self._accelerometer = Accelerometer(motor)
         switches = self._wishes.switches(self._camera.model)
@@ -279,7 +279,7 @@ class FreenectSource:
         )
 
 
-def _find(settings: FreenectSettings) -> tuple[usb_bus.KinectCamera, usb_bus.UsbDevice | None]:
+def find_kinect(settings: FreenectSettings) -> tuple[usb_bus.KinectCamera, usb_bus.UsbDevice | None]:
     """The camera to open, and the motor of the same Kinect where it has one."""
     devices = usb_bus.usb_devices()
     cameras = usb_bus.kinect_cameras(devices)

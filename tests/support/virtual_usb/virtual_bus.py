@@ -75,16 +75,21 @@ class InfraredFrames:
     """Infrared images that a virtual Kinect loops: ten bits a pixel, the upper eight as given here."""
 
     grey: npt.NDArray[np.uint8]  # (N,488,640)
+    high: npt.NDArray[np.uint8]  # (N,1024,1280)
 
     def write(self, kinect: "VirtualKinect") -> None:
         """Before the Kinect is plugged in."""
-        (kinect.folder / "ir.bin").write_bytes(pack_bits(self.grey.astype(np.uint16) << 2, bits=10))
+        for name, images in (("ir.bin", self.grey), ("ir_high.bin", self.high)):
+            (kinect.folder / name).write_bytes(pack_bits(images.astype(np.uint16) << 2, bits=10))
 
 
 @functools.cache
 def infrared_frames() -> InfraredFrames:
     """Noise, no two images alike."""
-    return InfraredFrames(np.random.default_rng(0).integers(0, 256, (3, 488, 640), np.uint8))
+    random = np.random.default_rng(0)
+    return InfraredFrames(
+        random.integers(0, 256, (3, 488, 640), np.uint8), random.integers(0, 256, (2, 1024, 1280), np.uint8)
+    )
 
 
 class VirtualKinect:
