@@ -28,6 +28,7 @@ from rig_protocol.frames import EncodedFrame, RgbdFrame
 from rig_protocol.messages import Hello
 from rig_protocol.rig_key import RigKey
 from rig_protocol.system_clock import SystemClock
+from rig_protocol.troubleshooting import Topic, see
 
 _log = logging.getLogger(__name__)
 
@@ -116,7 +117,9 @@ class Agent:
             if is_due(health.due_ns, time_ns, health.interval_ns):
                 _log.info("%s", health.line(self.totals, self._wanted is not None, time_ns))
             if hang.lasts(self._capture.last_sign_ns, time_ns):
-                raise RigError(f"the {self._settings.source} driver hangs: start the agent anew")
+                raise RigError(
+                    f"the {self._settings.source} driver hangs: start the agent anew", Topic.HANGING_KINECT
+                )
 
     def _wait(self, time_ns: int) -> None:
         """Sleep until a datagram or a frame comes or something is due."""
@@ -147,7 +150,11 @@ class Agent:
         self._uplink.close(now_ns())
         ended = self._capture.stop(_STOP_TIMEOUT_S)
         if not ended:
-            _log.warning("the %s driver does not return; leaving without it", self._settings.source)
+            _log.warning(
+                "the %s driver does not return; leaving without it",
+                self._settings.source,
+                extra=see(Topic.HANGING_KINECT),
+            )
         self._encoder.join()
         if ended:
             os.close(self._wake)

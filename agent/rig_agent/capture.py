@@ -10,6 +10,7 @@ from rig_agent.sources.base import FrameSource, SourceDescription, SourceLost
 from rig_agent.transport import now_ns
 from rig_protocol.frames import RgbdFrame
 from rig_protocol.gravity import Gravity
+from rig_protocol.troubleshooting import see
 
 _log = logging.getLogger(__name__)
 
@@ -84,7 +85,7 @@ class Capture:
                 if self.counters.captured > captured:
                     retry_s, told = _FIRST_RETRY_S, ""
                 if str(error) != told:
-                    _log.warning("%s; trying again until it is back", error)
+                    _log.warning("%s; trying again until it is back", error, extra=see(error.topic))
                 told = str(error)
                 self._stopping.wait(retry_s)
                 retry_s = min(2 * retry_s, _LAST_RETRY_S)

@@ -1,6 +1,7 @@
 """The joint estimate: poses, points and what is wrong with every camera in one adjustment, on patches.
 
-Keypoints start it. Then patches are looked for where the poses predict them, and again while the poses move.
+Keypoints start it. Then patches are looked for where the poses predict them, and again while the poses move;
+where a pair is left that is known too little, walls and floor that cameras share join them.
 Pairs that only the drawing predicts are led by depth first, with noise that goes down to what it is.
 """
 
@@ -20,6 +21,7 @@ from rig_calib.refinement import RefinedRig, refine
 from rig_calib.registration import ransac
 from rig_calib.rig_adjustment import AT_REST, AdjustedRig, adjust_rig
 from rig_calib.settings import CalibrationSettings
+from rig_calib.shared_planes import NOTHING_SHARED, find_shared_planes
 from rig_calib.uncertainty import weakest_direction
 from rig_protocol.poses import Pose, inverse, rotation_angle_deg
 from rig_protocol.rig_folder import RingDrawing
@@ -91,8 +93,11 @@ def estimate_jointly(
             noise = rig.observed_noise()
             if _largest_shift_px(before, rig.poses, regions) < _SETTLED_PX:
                 break
-    if noise.differs_from(rig.noise):
-        rig = adjust_rig(refined.cameras, matches, rig.poses, ring, settings, noise, rig.states)
+    shared = NOTHING_SHARED
+    if _any_weak(rig, regions, settings):
+        shared = find_shared_planes(cameras, rig.scene.cameras, rig.adjustment)
+    if noise.differs_from(rig.noise) or len(shared.planes):
+        rig = adjust_rig(refined.cameras, matches, rig.poses, ring, settings, noise, rig.states, shared)
     judged = in_threads(lambda edge: _refined_edge(edge, refined, matches, rig, settings), edges)
     return JointEstimate(rig, refined.cameras, tuple(judged))
 
@@ -159,6 +164,13 @@ def _refined_edge(
         return replace(edge, matches=_NO_MATCHES, inlier=np.zeros(0, dtype=bool), reason=reason)
     T_i_j = inverse(rig.poses[i]) @ rig.poses[j]
     return estimate_edge(refined.cameras[i], refined.cameras[j], rows, T_i_j, settings, rig.states)
+
+
+def _any_weak(rig: AdjustedRig, pairs: Iterable[Pair], settings: CalibrationSettings) -> bool:
+    """Whether the gate would refuse a pair: only there do shared planes know more than patches do."""
+    sigmas = [weakest_direction(rig.relative(i, j)[1]) for i, j in pairs if i in rig.poses and j in rig.poses]
+    limits = settings.max_pair_sigma_deg, settings.max_pair_sigma_m
+    return any(deg > limits[0] or metres > limits[1] for deg, metres in sigmas)
 
 
 def _prediction_px(rig: AdjustedRig, pairs: Iterable[Pair]) -> dict[Pair, float]:

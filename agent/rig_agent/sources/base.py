@@ -8,6 +8,7 @@ from typing import Literal, Protocol, Self
 from rig_protocol.camera import CameraModel
 from rig_protocol.errors import RigError
 from rig_protocol.frames import RgbdFrame
+from rig_protocol.troubleshooting import Topic
 
 ColorImage = Literal["bayer", "bgr", "grey"]
 DepthImage = Literal["raw", "depth_mm"]
@@ -16,6 +17,8 @@ ControlValue = bool | float | str
 
 class SourceLost(RigError):  # noqa: N818  # it reads as what happened: the source is lost
     """The device died or cannot be opened now: close the source, wait, open it again."""
+
+    topic = Topic.NO_FRAMES
 
 
 class ControlRefused(RigError):  # noqa: N818  # as above

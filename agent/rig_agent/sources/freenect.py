@@ -34,6 +34,7 @@ from rig_agent.usb.motor import Led, Motor
 from rig_protocol.errors import RigError
 from rig_protocol.frames import RgbdFrame
 from rig_protocol.settings import Settings
+from rig_protocol.troubleshooting import Topic
 
 FPS = 30.0
 _STOP_LIMIT_S = 2.0  # stopping takes one poll of 0.1 s and a few commands
@@ -154,7 +155,7 @@ class FreenectSource:
         try:
             pair = thread.next_pair(timeout_s)
         except SourceLost as error:
-            raise SourceLost(f"{self._camera} is gone (cable or power?): {error}") from error
+            raise SourceLost(f"{self._camera} is gone (cable or power?): {error}", Topic.NO_KINECT) from error
         if pair is not None:
             self._steps, self._last_sign_s = 0, time.monotonic()
             return self._frame(pair)
@@ -215,7 +216,10 @@ class FreenectSource:
         """Find, open and verify; errors are those of the constructor."""
         _hanging[:] = [thread for thread in _hanging if not thread.stop(0)]
         if _hanging:
-            raise RigError("libfreenect hangs in a Kinect that stopped answering: start the agent anew")
+            raise RigError(
+                "libfreenect hangs in a Kinect that stopped answering: start the agent anew",
+                Topic.HANGING_KINECT,
+            )
         self._camera, motor = find_kinect(self._settings)
         self._motor = Motor(motor)
         self._accelerometer = Accelerometer(motor)
@@ -244,7 +248,7 @@ class FreenectSource:
         """The next step of the ladder for a Kinect that is silent."""
         silent = f"{self._camera} has sent no images for {self._settings.timeout_s:g} s"
         if self._steps == len(_LADDER):
-            raise RigError(f"{silent}, whatever was tried: start the agent anew")
+            raise RigError(f"{silent}, whatever was tried: start the agent anew", Topic.HANGING_KINECT)
         step = _LADDER[self._steps]
         self._steps += 1
         log.warning("%s; %s", silent, self._restart(step))

@@ -25,6 +25,7 @@ from rig_agent.sources.base import SourceLost
 from rig_agent.sources.frame_pairing import Stream, StreamImage
 from rig_agent.sources.freenect_formats import ImageFormat
 from rig_protocol.errors import RigError
+from rig_protocol.troubleshooting import Topic
 
 _LIBUSB_INTERRUPTED = -10  # a signal arrived; nothing is wrong
 _PACKETS = re.compile(rb"Got (video|depth) frame .*, (\d+)/(\d+) packets")
@@ -218,7 +219,10 @@ class _ImageStream:
         """Libfreenect's result; RigError when it does not know the format."""
         mode = self._find_mode(form.resolution, form.code)
         if not mode.is_valid or mode.bytes != form.bytes:
-            raise RigError(f"libfreenect has no {self._stream} of {form.bytes} bytes: use libfreenect 0.5")
+            raise RigError(
+                f"libfreenect has no {self._stream} of {form.bytes} bytes: use libfreenect 0.5",
+                Topic.MISSING_LIBRARY,
+            )
         self._buffer = form.empty() if form.converted else None
         # Of the format before it, a buffer may be left that is too small: libfreenect would write on.
         self._set_buffer(self._device, None if self._buffer is None else self._buffer.ctypes.data)
