@@ -248,7 +248,7 @@ class FreenectSource:
         """The next step of the ladder for a Kinect that is silent."""
         silent = f"{self._camera} has sent no images for {self._settings.timeout_s:g} s"
         if self._steps == len(_LADDER):
-            raise RigError(f"{silent}, whatever was tried: start the agent anew", Topic.HANGING_KINECT)
+            raise RigError(f"{silent}, whatever was tried: start the agent anew", Topic.NO_FRAMES)
         step = _LADDER[self._steps]
         self._steps += 1
         log.warning("%s; %s", silent, self._restart(step))
