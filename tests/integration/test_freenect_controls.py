@@ -221,3 +221,19 @@ def test_a_kinect_that_stops_answering_is_lost_and_not_waited_for(kinect: Virtua
         with pytest.raises(SourceLost, match=r"did not answer within 0\.5 s"):
             source.control("depth", False)
     assert "reset Xbox NUI Camera" in kinect.log()
+
+
+def test_what_the_kinect_does_not_take_is_refused_and_costs_nothing_else(kinect: VirtualKinect) -> None:
+    kinect.write("deaf_sensor")
+    with FreenectSource(FreenectSettings()) as source:
+        for _ in range(2):
+            with pytest.raises(ControlRefused, match="does not take auto_exposure = false"):
+                source.control("auto_exposure", False)
+        source.control("mirror", True)
+        next_frame(source)
+
+
+def test_an_unplugged_kinect_loses_a_control_at_once(source: FreenectSource, kinect: VirtualKinect) -> None:
+    kinect.unplug()
+    with pytest.raises(SourceLost, match="libfreenect cannot"):
+        source.control("depth", False)

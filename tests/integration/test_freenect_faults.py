@@ -8,12 +8,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from rig_agent.capture import Capture
 from rig_agent.sources import freenect
 from rig_agent.sources.base import SourceLost
 from rig_agent.sources.freenect import FreenectSettings, FreenectSource
 from rig_agent.sources.freenect_formats import DepthName
 from rig_agent.usb import enumerate as usb_enumerate
 from rig_protocol.errors import ConfigurationError, RigError
+from rig_protocol.frames import RgbdFrame
 from support.virtual_usb.virtual_bus import VirtualBus, VirtualKinect, kinect_frames
 
 SERIAL = "A00364A11111111A"
@@ -202,6 +204,39 @@ def test_a_camera_beyond_help_asks_for_a_new_process(
     kinect.clear("mute")
     with FreenectSource(FreenectSettings()) as source:
         assert source.read(2.0) is not None
+
+
+@pytest.mark.parametrize("fault", ["deny", "busy", "mute", "stall", "unplugged"])
+def test_the_agent_has_images_again_once_a_fault_is_mended(kinect: VirtualKinect, fault: str) -> None:
+    failed, whole = threading.Event(), threading.Event()
+    told: list[Exception] = []
+
+    def open_source() -> FreenectSource:
+        try:
+            return FreenectSource(IMPATIENT)
+        except SourceLost:
+            failed.set()
+            raise
+
+    def take(_: RgbdFrame) -> None:
+        whole.set()
+
+    if fault == "unplugged":
+        kinect.unplug()
+    else:
+        kinect.write(fault)
+    capture = Capture(open_source, None, lambda _: None, take, told.append)
+    capture.start()
+    if fault == "stall":  # it opens, and is silent
+        assert not whole.wait(0.3)
+    else:
+        assert failed.wait(10)
+    kinect.clear(fault)
+    if fault == "unplugged":
+        kinect.plug()
+    assert whole.wait(20)
+    assert capture.stop(10)
+    assert told == []
 
 
 @pytest.mark.parametrize("stream", ["video", "depth"])

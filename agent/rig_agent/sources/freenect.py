@@ -17,6 +17,7 @@ from pydantic import Field
 
 from rig_agent.sources.base import (
     ColorImage,
+    ControlRefused,
     ControlValue,
     SourceDescription,
     SourceLost,
@@ -182,7 +183,8 @@ class FreenectSource:
             case "restart":
                 return self._restart("stream" if value is True else one_of(RestartStep, name, value))
         wishes = self._wishes.told(name, value, self._camera.model)
-        thread.switch(wishes.switches(self._camera.model), self._settings.timeout_s)
+        if not thread.switch(wishes.switches(self._camera.model), self._settings.timeout_s):
+            raise ControlRefused(f"the Kinect does not take {name} = {str(value).lower()}")
         self._wishes, self._last_sign_s = wishes, time.monotonic()
         return f"{name} is {str(value).lower()}"
 

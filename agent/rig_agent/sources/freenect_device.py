@@ -112,11 +112,13 @@ class FreenectDevice:
             for stream in ("video", "depth")
         }
 
-    def switch(self, switches: Switches) -> None:
-        """Start, stop and set what differs from how it is; SourceLost when the camera refuses.
+    def switch(self, switches: Switches) -> bool:
+        """Start, stop and set what differs from how it is; False when a flag was not taken.
 
-        A stream that goes on is not disturbed, whatever happens to the other one.
+        A stream that goes on is not disturbed, whatever happens to the other one. SourceLost when the camera
+        does not start or stop one.
         """
+        self._errors.clear()
         wanted: dict[Stream, ImageFormat | None] = {"depth": switches.depth, "video": switches.video}
         # Infrared in high resolution is refused while depth is on: first all stops, then all starts.
         for stream, form in wanted.items():
@@ -127,16 +129,18 @@ class FreenectDevice:
                 self._check(self._streams[stream].start(form), f"start {stream}")
                 # A stream starts unmirrored.
                 self._flags[fn.FLAG_MIRROR_VIDEO if stream == "video" else fn.FLAG_MIRROR_DEPTH] = False
-        for flag, on in switches.flags.items():
-            if self._flags.get(flag) != on:
-                self._set_flag(flag, on)
+        if self._errors:  # libfreenect starts and stops without regard to commands that failed: its log tells
+            self._check(-1, "switch its streams")
+        changed = {flag: on for flag, on in switches.flags.items() if self._flags.get(flag) != on}
+        refused = [flag for flag, on in changed.items() if not self._set_flag(flag, on)]
+        return not refused
 
-    def restart(self, switches: Switches) -> None:
-        """Stop both streams and start them anew; SourceLost when the camera refuses."""
+    def restart(self, switches: Switches) -> bool:
+        """Stop both streams and start them anew; results are those of `switch`."""
         for stream in self._streams.values():
             if stream.form is not None:
                 stream.stop()
-        self.switch(switches)
+        return self.switch(switches)
 
     def process(self, timeout_s: float) -> None:
         """Wait for packets and deliver what is complete; SourceLost when the device is gone."""
@@ -169,12 +173,15 @@ class FreenectDevice:
         library.freenect_select_subdevices(self._context, fn.DEVICE_CAMERA)
         self._check(library.freenect_open_device(self._context, c.byref(self._device), index), "open")
 
-    def _set_flag(self, flag: int, on: bool) -> None:
-        """A flag that the Kinect does not take is no reason to do without its images."""
+    def _set_flag(self, flag: int, on: bool) -> bool:
+        """False for one that the Kinect does not take, which is no reason to do without its images."""
         set_flag = getattr(self._library, "freenect_set_flag", None)
-        if set_flag is None or set_flag(self._device, flag, on) < 0:  # success may be any number from 0 on
-            log.warning("the Kinect does not take flag %#x = %d", flag, on)
-        self._flags[flag] = on
+        if set_flag is not None and set_flag(self._device, flag, on) >= 0:  # success may be any of these
+            self._flags[flag] = on
+            return True
+        log.warning("the Kinect does not take flag %#x = %d", flag, on)
+        self._flags.setdefault(flag, on)  # what was refused at the start is not asked for at every switch
+        return False
 
     def _check(self, result: int, what: str) -> None:
         if result < 0:

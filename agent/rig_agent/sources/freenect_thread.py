@@ -26,6 +26,8 @@ _POLL_S = 0.1
 
 log = logging.getLogger(__name__)
 
+_Order = Callable[[FreenectDevice], bool]
+
 
 class FreenectThread:
     """Opens the `index`-th Kinect on a thread of its own and streams until stopped or lost."""
@@ -41,9 +43,7 @@ class FreenectThread:
         self._stopping = False
         self._overrun = 0
         self._device: FreenectDevice | None = None
-        self._orders: queue.SimpleQueue[tuple[Callable[[FreenectDevice], None], Future[None]]] = (
-            queue.SimpleQueue()
-        )
+        self._orders: queue.SimpleQueue[tuple[_Order, Future[bool]]] = queue.SimpleQueue()
         self._thread = threading.Thread(
             target=self._run, args=(library, index, switches), name="freenect", daemon=True
         )  # a daemon, because a thread that hangs in libfreenect must not keep the program alive
@@ -81,35 +81,36 @@ class FreenectThread:
                 raise self._error
             return None
 
-    def switch(self, switches: Switches, timeout_s: float, restart: bool = False) -> None:
-        """Make the streams so, or all of them anew, and forget the images before.
+    def switch(self, switches: Switches, timeout_s: float, restart: bool = False) -> bool:
+        """Make the streams so, or all of them anew, and forget the images before; False as the device.
 
         SourceLost when the device does not come along within the limit.
         """
 
-        def order(device: FreenectDevice) -> None:
-            (device.restart if restart else device.switch)(switches)
+        def order(device: FreenectDevice) -> bool:
+            taken = (device.restart if restart else device.switch)(switches)
             self._pairer.start_anew(with_depth=switches.depth is not None)
             with self._changed:
                 self._pairs.clear()
+            return taken
 
-        self._do(order, timeout_s)
+        done: Future[bool] = Future()
+        with self._changed:
+            if self._error:
+                raise self._error
+            self._orders.put((order, done))
+        try:
+            return done.result(timeout_s)
+        except TimeoutError as error:
+            raise SourceLost(
+                f"the camera did not answer within {timeout_s:g} s", Topic.HANGING_KINECT
+            ) from error
 
     def stop(self, timeout_s: float) -> bool:
         """Ask the thread to close the device; False when it is still in libfreenect after the limit."""
         self._stopping = True
         self._thread.join(timeout_s)
         return not self._thread.is_alive()
-
-    def _do(self, order: Callable[[FreenectDevice], None], timeout_s: float) -> None:
-        done: Future[None] = Future()
-        self._orders.put((order, done))
-        try:
-            done.result(timeout_s)
-        except TimeoutError as error:
-            raise self._error or SourceLost(
-                f"the camera did not answer within {timeout_s:g} s", Topic.HANGING_KINECT
-            ) from error
 
     def _run(self, library: ctypes.CDLL, index: int, switches: Switches) -> None:
         try:
@@ -140,11 +141,11 @@ class FreenectThread:
         while not self._orders.empty():
             order, done = self._orders.get()
             try:
-                order(device)
+                taken = order(device)
             except RigError as error:
                 done.set_exception(error)
                 raise
-            done.set_result(None)
+            done.set_result(taken)
 
     def _on_image(self, image: StreamImage) -> None:
         pair = self._pairer.add(image)
@@ -160,4 +161,6 @@ class FreenectThread:
     def _fail(self, error: RigError) -> None:
         with self._changed:
             self._error = error
+            while not self._orders.empty():
+                self._orders.get()[1].set_exception(error)
             self._changed.notify_all()

@@ -143,6 +143,8 @@ void camera_command(struct kinect *kinect, const uint8_t *request, int length)
     put16(reply + 2, (unsigned)answered / 2);
     memcpy(reply + 4, request + 4, 4); /* command and tag come back */
     kinect->reply_length = HEADER + answered;
+    if (kinect->faults.deaf_sensor && get16(request + 4) == CMOS_REGISTER)
+        reply[4] ^= 0xff; /* the answer to no command */
 }
 
 /* The reply to the last command, once; 0 bytes when there is none. */

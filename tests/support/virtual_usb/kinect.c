@@ -175,6 +175,7 @@ static void read_faults(struct kinect *kinect)
     faults->busy = has(kinect, "busy");
     faults->mute = has(kinect, "mute");
     faults->mute_motor = has(kinect, "mute_motor");
+    faults->deaf_sensor = has(kinect, "deaf_sensor");
     faults->stall = has(kinect, "stall");
     kinect_read_line(kinect, "lose", line, sizeof line);
     faults->lose_percent = atof(line);
