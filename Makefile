@@ -5,7 +5,7 @@ BIN    := $(VENV)/bin
 READY  := $(VENV)/.ready
 BENCH  := $(VENV)/.ready-bench
 
-.PHONY: demo test lint bench bench-codecs bench-transport bench-calibration soak fuzz docs clean
+.PHONY: demo test lint bench bench-codecs bench-transport bench-calibration bench-kinect soak fuzz docs clean
 
 demo: $(READY)  ## twelve simulated Kinects over loopback UDP, calibrated and fused into build/demo
 	$(BIN)/rig-server --calibrate --simulate 12 --frames 5 --out build/demo
@@ -35,6 +35,11 @@ bench-transport: $(BENCH) bench-codecs  ## the transport against its bars and it
 
 bench-calibration: $(BENCH)  ## the calibration against its bars, the bound and its peers, into docs/accuracy.md
 	$(BIN)/python tests/benchmarks/bench_calibration.py
+
+bench-kinect: $(READY)  ## a Kinect on the virtual USB bus: cost, torn frames, a thousand replugs
+	$(BIN)/python tests/benchmarks/kinect_capture.py
+	$(BIN)/python tests/benchmarks/kinect_replug.py
+	$(BIN)/python tests/benchmarks/bench_kinect.py
 
 bench: bench-transport bench-calibration  ## all figures, into build/bench.json
 

@@ -15,7 +15,7 @@ from dataclasses import fields, replace
 from rig_agent import service
 from rig_agent.capture import Capture
 from rig_agent.config import AgentSettings
-from rig_agent.encoder import encode_frame
+from rig_agent.encoder import encode_frame, fits
 from rig_agent.frame_queue import FrameQueue
 from rig_agent.health import HealthLog, Totals, gauges
 from rig_agent.hello import make_hello
@@ -182,8 +182,8 @@ class Agent:
                 frame, wanted = self._captured.get(_TICK_S), self._wanted
                 if frame is None:
                     continue
-                if wanted is None:
-                    self._unheard += 1
+                if wanted is None or not fits(frame, wanted.color_codec, wanted.depth_codec):
+                    self._unheard += 1  # nobody listens, or not yet to a camera that was switched
                     continue
                 named = replace(frame, camera_id=wanted.camera_id)
                 self._encoded.put(encode_frame(named, wanted.color_codec, wanted.depth_codec))

@@ -25,6 +25,8 @@ _EXAMPLES = """
 
 `rig-agent --source synthetic --camera 0 --seed 7` — one camera of the simulated ring
 
+`rig-agent still board-01.png` — one image for the calibration of a lens
+
 `rig-agent --check` — what keeps this machine from streaming, and what mends it
 
 `rig-agent init` — write ./agent.toml, every option explained, then edit it and run `rig-agent`
@@ -145,6 +147,36 @@ def init(
 
     write_commented_toml(AgentSettings, path, force)
     typer.echo(f"Wrote {path}. Edit it, then run: rig-agent --config {path}")
+
+
+@app.command()
+def still(
+    path: Annotated[Path, typer.Argument(help="PNG file to write.")],
+    infrared: Annotated[
+        bool, typer.Option("--infrared", help="The depth camera's image instead of the colour camera's.")
+    ] = False,
+    high: Annotated[bool, typer.Option("--high", help="1280×1024 pixels instead of 640×480.")] = False,
+    serial: Annotated[
+        str | None, typer.Option(metavar="NUMBER", help="Which Kinect, where there are several.")
+    ] = None,
+    config: Annotated[Path | None, typer.Option(help="Settings file, as of rig-agent itself.")] = None,
+) -> None:
+    """Save one image of this machine's Kinect, for `rig-calib intrinsics`; the agent must not be running."""
+    import cv2
+
+    from rig_agent.config import load_agent_settings
+    from rig_agent.sources.freenect_still import take_still
+
+    if path.suffix.lower() != ".png":
+        raise ConfigurationError(f"{path} would lose what the sensor saw: give a name that ends in .png")
+    settings = load_agent_settings(config, {"freenect": {"serial": serial}})
+    set_up_logging(settings.log_level)
+    image = take_still(settings.freenect, "ir" if infrared else "color", high)
+    try:
+        path.write_bytes(cv2.imencode(".png", image)[1].tobytes())
+    except OSError as error:
+        raise ConfigurationError(f"{path} cannot be written: {error.strerror}") from error
+    typer.echo(f"Wrote {path}: {image.shape[1]}×{image.shape[0]} pixels")
 
 
 def main() -> None:

@@ -7,6 +7,19 @@ from rig_protocol.codecs import codec
 from rig_protocol.frames import EncodedFrame, ImageU8, Payload, RgbdFrame
 
 
+def fits(frame: RgbdFrame, color_codec: int | None, depth_codec: int | None) -> bool:
+    """Whether the codecs take this frame's images; not so when the camera was just switched to infrared."""
+    color_kinds = ("bayer", "bgr") if frame.bayer is not None else (_kind_of_color(frame),)
+    depth_kinds = ("depth_mm",) if frame.raw is None else ("raw",)
+    return all(
+        codec_id is None or codec(codec_id).image in kinds or not present
+        for codec_id, kinds, present in (
+            (color_codec, color_kinds, frame.bayer is not None or frame.color is not None),
+            (depth_codec, depth_kinds, frame.raw is not None or frame.depth_mm is not None),
+        )
+    )
+
+
 def encode_frame(frame: RgbdFrame, color_codec: int | None, depth_codec: int | None) -> EncodedFrame:
     """Encode both images; a stream without codec, or without image in this frame, has no payload.
 
@@ -45,6 +58,10 @@ def _depth_payload(frame: RgbdFrame, codec_id: int) -> Payload | None:
     if chosen.image != ("depth_mm" if frame.raw is None else "raw"):
         raise ValueError(f"codec {chosen.name} cannot take the depth image of camera {frame.camera_id}")
     return Payload(codec_id, chosen.encode(image))
+
+
+def _kind_of_color(frame: RgbdFrame) -> str:
+    return "bgr" if frame.color is not None and frame.color.ndim == 3 else "grey"
 
 
 def _demosaic(bayer: ImageU8) -> ImageU8:

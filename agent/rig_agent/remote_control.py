@@ -13,8 +13,7 @@ _log = logging.getLogger(__name__)
 
 _LEVELS = ("DEBUG", "INFO", "WARNING", "ERROR")
 _MAX_ANSWERS = 32  # the server has one control under way; more are of sessions that have ended
-# Streams that must not stay off when the server that switched them off has gone.
-_STREAMS = frozenset({"depth", "color"})
+_DEPTH = "depth"  # must not stay off when the server that switched it off has gone
 _LAST_ANSWER_NS = 500_000_000  # in which a lost answer is asked for again before the agent restarts
 
 
@@ -32,7 +31,7 @@ class RemoteControl:
     def __init__(self, capture: Capture, wake: Callable[[], None]) -> None:
         self._capture, self._wake = capture, wake
         self._answers: deque[Answer] = deque(maxlen=_MAX_ANSWERS)
-        self._switched_off: set[str] = set()
+        self._depth_is_off = False
         self._restart_ns: int | None = None
 
     def take(self, request: ControlRequested, now_ns: int) -> None:
@@ -49,10 +48,10 @@ class RemoteControl:
                 )
 
     def session_ended(self) -> None:
-        """Nobody is there any more to switch on again what was switched off."""
-        for name in sorted(self._switched_off):
-            self._capture.control(name, True, lambda done, text: _log.info("the server has gone: %s", text))  # noqa: ARG005  # the log tells the words
-        self._switched_off.clear()
+        """Nobody is there any more to switch depth on again."""
+        if self._depth_is_off:
+            self._depth_is_off = False
+            self._capture.control(_DEPTH, True, _log_what_was_done)
 
     def next_answer(self) -> Answer | None:
         """The oldest answer that was not fetched yet."""
@@ -64,10 +63,14 @@ class RemoteControl:
 
     def _answer(self, request: ControlRequested, done: bool, text: str) -> None:
         _log.info("%s = %s by the server: %s", request.name, request.value, text)
-        if done and request.name in _STREAMS:
-            (self._switched_off.discard if request.value else self._switched_off.add)(request.name)
+        if done and request.name == _DEPTH:
+            self._depth_is_off = not request.value
         self._answers.append(Answer(request, done, text))
         self._wake()
+
+
+def _log_what_was_done(_done: bool, text: str) -> None:
+    _log.info("the server has gone: %s", text)
 
 
 def _set_log_level(value: ControlValue) -> tuple[bool, str]:

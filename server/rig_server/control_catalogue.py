@@ -35,9 +35,10 @@ CATALOGUE = (
     ControlEntry("auto_exposure", "switch", "on, off", "whether the colour camera sets its exposure"),
     ControlEntry("auto_white_balance", "switch", "on, off", "whether it sets its white balance"),
     ControlEntry("near_mode", "switch", "on, off", "depth from 0.4 m on (Kinect for Windows only)"),
-    ControlEntry("color", "switch", "on, off", "the colour stream"),
+    ControlEntry("mirror", "switch", "on, off", "images as a mirror shows them"),
+    ControlEntry("color", "word", "bayer, rgb, ir", "what the colour stream carries"),
     ControlEntry("depth", "switch", "on, off", "the depth stream and its infrared projector"),
-    ControlEntry("restart", "action", "", "stop the streams and start them again"),
+    ControlEntry("restart", "action", "stream, device, usb", "start the streams, or more, anew; else stream"),
     ControlEntry("reopen_source", "action", "", "close the device and open it again (any source)"),
     ControlEntry("restart_agent", "action", "", "start the agent's program anew"),
     ControlEntry("log_level", "word", "DEBUG, INFO, WARNING, ERROR", "what is worth a line in its log"),
@@ -56,7 +57,7 @@ def parse_value(name: str, text: str | None) -> ControlValue:
             raise ConfigurationError(f"{name} needs a value ({kind}): rig-server control --list")
         return True
     word = text.strip()
-    if kind == "word":
+    if kind in ("word", "action"):
         return word
     if kind != "number" and word.lower() in _SWITCH_WORDS:
         return _SWITCH_WORDS[word.lower()]

@@ -8,15 +8,23 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from rig_agent.capture import Capture
 from rig_agent.sources import freenect
 from rig_agent.sources.base import SourceLost
 from rig_agent.sources.freenect import FreenectSettings, FreenectSource
+from rig_agent.sources.freenect_formats import DepthName
 from rig_agent.usb import enumerate as usb_enumerate
 from rig_protocol.errors import ConfigurationError, RigError
+from rig_protocol.frames import RgbdFrame
 from support.virtual_usb.virtual_bus import VirtualBus, VirtualKinect, kinect_frames
 
 SERIAL = "A00364A11111111A"
 IMPATIENT = FreenectSettings(timeout_s=0.5)
+
+
+@pytest.fixture(autouse=True)
+def _nothing_untold() -> None:
+    freenect._untold.clear()
 
 
 @pytest.fixture
@@ -100,11 +108,60 @@ def test_a_replug_too_quick_to_see_is_a_loss_too(kinect: VirtualKinect) -> None:
         read_until_lost(source, limit_s=1.0)
 
 
-def test_images_that_stop_coming_are_a_loss_after_the_time_out(kinect: VirtualKinect) -> None:
+def read_until_counted(source: FreenectSource, counter: str, limit_s: float = 5.0) -> None:
+    """Read on until the source has taken this step once."""
+    end_s = time.monotonic() + limit_s
+    while source.counters[counter] == 0:
+        source.read(0.1)
+        assert time.monotonic() < end_s, f"no step {counter} within {limit_s} s"
+
+
+def test_a_silent_kinect_climbs_the_ladder_and_each_step_is_logged_and_counted(
+    kinect: VirtualKinect, caplog: pytest.LogCaptureFixture
+) -> None:
     with FreenectSource(IMPATIENT) as source:
         assert source.read(2.0) is not None
         kinect.write("stall")
-        assert "no images for 0.5 s" in str(read_until_lost(source, limit_s=3.0))
+        with pytest.raises(RigError, match="whatever was tried: start the agent anew") as end:
+            read_until_lost(source, limit_s=15.0)
+        counters = source.counters
+    assert not isinstance(end.value, SourceLost), "trying again in this process cannot help"
+    assert (counters["stream_restarts"], counters["device_restarts"], counters["usb_resets"]) == (1, 1, 1)
+    steps = [record.message for record in caplog.records if "no images for 0.5 s" in record.message]
+    assert [step.split("; ")[1] for step in steps] == [
+        "its streams were restarted",
+        "it was opened anew",
+        "its USB port was reset",
+    ]
+    assert kinect.log().count("reset Xbox NUI Camera") == 1
+    assert kinect.open_handles() == 0
+
+
+def test_a_stream_that_came_back_begins_the_ladder_at_its_foot(kinect: VirtualKinect) -> None:
+    with FreenectSource(IMPATIENT) as source:
+        for restarts in (1, 2):
+            assert source.read(2.0) is not None
+            kinect.write("stall")
+            end_s = time.monotonic() + 5
+            while source.counters["stream_restarts"] < restarts and time.monotonic() < end_s:
+                source.read(0.1)
+            kinect.clear("stall")
+        assert source.read(2.0) is not None
+        assert source.counters["stream_restarts"] == 2
+        assert source.counters["device_restarts"] == 0
+
+
+def test_what_the_operator_set_outlives_the_ladder(kinect: VirtualKinect) -> None:
+    with FreenectSource(IMPATIENT) as source:
+        source.control("depth", False)
+        source.control("mirror", True)
+        kinect.write("stall")
+        read_until_counted(source, "device_restarts")
+        kinect.clear("stall")
+        frame = source.read(2.0)
+        assert frame is not None
+        assert frame.raw is None
+    assert kinect.log().count("register 0047=0001") >= 2, "mirrored after the reopening, too"
 
 
 def test_a_camera_that_never_answers_does_not_hang_opening(kinect: VirtualKinect) -> None:
@@ -116,6 +173,7 @@ def test_a_camera_that_never_answers_does_not_hang_opening(kinect: VirtualKinect
     assert "reset Xbox NUI Camera" in kinect.log()
     with FreenectSource(IMPATIENT) as source:
         assert source.read(2.0) is not None, "the reset did not help"
+        assert source.counters["usb_resets"] == 1, "the source that could not open did not live to tell"
 
 
 def test_a_camera_that_stops_answering_does_not_hang_closing(kinect: VirtualKinect) -> None:
@@ -148,6 +206,39 @@ def test_a_camera_beyond_help_asks_for_a_new_process(
         assert source.read(2.0) is not None
 
 
+@pytest.mark.parametrize("fault", ["deny", "busy", "mute", "stall", "unplugged"])
+def test_the_agent_has_images_again_once_a_fault_is_mended(kinect: VirtualKinect, fault: str) -> None:
+    failed, whole = threading.Event(), threading.Event()
+    told: list[Exception] = []
+
+    def open_source() -> FreenectSource:
+        try:
+            return FreenectSource(IMPATIENT)
+        except SourceLost:
+            failed.set()
+            raise
+
+    def take(_: RgbdFrame) -> None:
+        whole.set()
+
+    if fault == "unplugged":
+        kinect.unplug()
+    else:
+        kinect.write(fault)
+    capture = Capture(open_source, None, lambda _: None, take, told.append)
+    capture.start()
+    if fault == "stall":  # it opens, and is silent
+        assert not whole.wait(0.3)
+    else:
+        assert failed.wait(10)
+    kinect.clear(fault)
+    if fault == "unplugged":
+        kinect.plug()
+    assert whole.wait(20)
+    assert capture.stop(10)
+    assert told == []
+
+
 @pytest.mark.parametrize("stream", ["video", "depth"])
 @pytest.mark.parametrize("packet", [0, 100, -1])
 def test_a_frame_with_a_lost_packet_is_flagged_and_its_neighbours_are_not(
@@ -171,11 +262,14 @@ def test_a_frame_with_a_lost_packet_is_flagged_and_its_neighbours_are_not(
     assert damaged in (5, 6, 7), "every fourth frame lost a packet, no other did"
 
 
-def test_random_packet_loss_never_yields_a_torn_frame_without_flag(kinect: VirtualKinect) -> None:
+@pytest.mark.parametrize("depth_format", ["11bit", "11bit_packed"])
+def test_random_packet_loss_never_yields_a_torn_frame_without_flag(
+    kinect: VirtualKinect, depth_format: DepthName
+) -> None:
     kinect.write("lose", "0.2")
     recorded = kinect_frames()
     whole = 0
-    with FreenectSource(FreenectSettings()) as source:
+    with FreenectSource(FreenectSettings(depth_format=depth_format)) as source:
         for _ in range(60):
             frame = source.read(2.0)
             assert frame is not None

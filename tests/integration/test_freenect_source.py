@@ -9,7 +9,7 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from rig_agent.sources.freenect import FreenectSettings, FreenectSource
+from rig_agent.sources.freenect import COUNTERS, FreenectSettings, FreenectSource
 from rig_protocol.errors import ConfigurationError
 from rig_protocol.frames import RgbdFrame
 from rig_protocol.gravity import Gravity
@@ -48,7 +48,7 @@ def test_real_frames_arrive_byte_exact_and_paired_at_30_fps(usb_bus: VirtualBus)
     indices = [index_in(kinect_frames(), frame) for frame in frames]
     missing = sum((later - earlier - 1) % 12 for earlier, later in pairwise(indices))
     assert missing == counters["overrun"], "a frame vanished without being counted"
-    assert counters == {"damaged": 0, "unpaired": 0, "overrun": missing, "unreported": 0}
+    assert counters == {**dict.fromkeys(COUNTERS, 0), "overrun": missing}
     assert [frame.sequence for frame in frames] == list(range(len(frames)))
     duration_ns = frames[-1].timestamp_ns - frames[0].timestamp_ns
     assert duration_ns > 2e9
@@ -87,7 +87,7 @@ def test_factory_data_gives_the_depth_model(usb_bus: VirtualBus) -> None:
     usb_bus.add_kinect("A00364A11111111A")
     with FreenectSource(FreenectSettings()) as source:
         model = source.describe().model
-    assert model.source == "factory"
+    assert model.source == "default", "the factory data is silent about the colour camera: it is not measured"
     assert model.depth is not None
     assert model.depth.fx == pytest.approx(575.8, abs=0.05)  # 120 / (2 × 0.1042)
     assert model.raw_model.numerator_m == pytest.approx(345.489, abs=0.001)
@@ -172,7 +172,7 @@ def test_a_motor_that_never_answers_costs_no_frame(usb_bus: VirtualBus) -> None:
 def test_a_child_process_finds_the_virtual_bus_in_place_of_the_machines(usb_bus: VirtualBus) -> None:
     kinect = usb_bus.add_kinect("A00364A11111111A")
     program = (
-        "from rig_agent.sources.freenect import FreenectSettings, FreenectSource\n"
+        "from rig_agent.sources.freenect import COUNTERS, FreenectSettings, FreenectSource\n"
         "with FreenectSource(FreenectSettings()) as source:\n"
         "    print(source.describe().serial, source.read(2.0).raw.shape)"
     )

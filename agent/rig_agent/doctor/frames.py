@@ -5,7 +5,7 @@ import time
 from rig_agent.config import AgentSettings
 from rig_agent.doctor.finding import Check, Finding, failed, ok, skipped, warning
 from rig_agent.doctor.machine import Machine
-from rig_agent.sources.base import FrameSource, SourceDescription, SourceLost
+from rig_agent.sources.base import FrameSource, SourceDescription
 from rig_protocol.errors import RigError
 from rig_protocol.troubleshooting import Topic
 
@@ -27,7 +27,7 @@ def frames(machine: Machine, settings: AgentSettings) -> tuple[Finding, SourceDe
             return skipped(Check.FRAMES, "the rig-agent that runs here reads them"), description
         if error.topic == Topic.NO_KINECT and settings.source == "freenect":
             return skipped(Check.FRAMES, f"there is no Kinect to read ({Check.KINECT})"), description
-        hardware = isinstance(error, SourceLost) and error.topic in _HARDWARE
+        hardware = error.topic in _HARDWARE
         mend = None if hardware else "rig-agent --print-config"
         return failed(Check.FRAMES, str(error), mend, error.topic, hardware), description
 

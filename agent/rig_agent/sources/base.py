@@ -53,7 +53,7 @@ class FrameSource(Protocol):
         ...
 
     def describe(self) -> SourceDescription:
-        """Constant while the source is open."""
+        """Constant while the source is open, but for controls that change its images (`color`)."""
         ...
 
     def read(self, timeout_s: float) -> RgbdFrame | None:

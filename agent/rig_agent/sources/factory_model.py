@@ -1,4 +1,10 @@
-"""A unit's own depth model from the zero-plane data in its firmware."""
+"""A unit's own depth model from the zero-plane data in its firmware.
+
+It holds the depth camera's focal length and the scale of its disparity. It is silent about the colour camera,
+principal points, distortion and how the cameras stand to each other (libfreenect gives 2.4 cm between them,
+whatever the unit says). So the model's `source` stays "default": calibration must leave all that as wide as
+for a unit of which nothing is known.
+"""
 
 from rig_agent.sources.libfreenect import ZeroPlane
 from rig_protocol.camera import CameraModel, Intrinsics, RawDepthModel
@@ -32,9 +38,7 @@ def camera_model(zero_plane: ZeroPlane | None) -> CameraModel:
     ):
         return CameraModel()
     return CameraModel(
-        depth=Intrinsics(focal_px, focal_px, 319.5, 239.5),
-        raw_model=RawDepthModel(numerator_m, offset),
-        source="factory",
+        depth=Intrinsics(focal_px, focal_px, 319.5, 239.5), raw_model=RawDepthModel(numerator_m, offset)
     )
 
 

@@ -24,10 +24,20 @@ class StreamImage:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class ImagePair:
-    """Depth and colour of one instant."""
+    """Depth and colour of one instant; no depth while its stream is off."""
 
-    depth: StreamImage
+    depth: StreamImage | None
     video: StreamImage
+
+    @property
+    def clocked(self) -> StreamImage:
+        """The image whose time is the pair's."""
+        return self.video if self.depth is None else self.depth
+
+    @property
+    def damaged(self) -> bool:
+        """True when a part of either is missing."""
+        return self.video.damaged or (self.depth is not None and self.depth.damaged)
 
 
 class FramePairer:
@@ -37,9 +47,16 @@ class FramePairer:
         """Nothing waits yet."""
         self.unpaired = 0
         self._waiting: StreamImage | None = None
+        self._with_depth = True
+
+    def start_anew(self, with_depth: bool) -> None:
+        """The streams were switched: what waits has no partner to come, and that is no fault."""
+        self._waiting, self._with_depth = None, with_depth
 
     def add(self, image: StreamImage) -> ImagePair | None:
         """The pair that this image completes, if it does; an image whose partner cannot come is counted."""
+        if not self._with_depth:
+            return ImagePair(None, image) if image.stream == "video" else None
         waiting = self._waiting
         if waiting is None:
             self._waiting = image

@@ -1,12 +1,11 @@
-"""One Kinect in a libfreenect context of its own: Bayer and 11-bit depth, with the damage told.
+"""One Kinect in a libfreenect context of its own: its streams, its switches, and the damage told.
 
 libfreenect delivers a frame with up to five lost USB packets as good, stale bytes in it. At its log
 level SPEW it says before each frame how many packets arrived; that is what marks a frame as damaged.
 (Its chunk callbacks would tell too, at the price of 12,000 Python calls a second.)
 
-Depth is unpacked by libfreenect into our buffers, swapped in the callback: no copy, and torn data
-cannot leak between frames. Bayer is copied from libfreenect's buffer: it writes the first packet of
-the next frame before it delivers a frame whose last packet was lost, so swapping would lose that packet.
+Images that libfreenect converts come in our own buffers, swapped in the callback: no copy, and torn data
+cannot leak between frames. The others (Bayer, packed depth) are copied: see `ImageFormat.converted`.
 """
 
 import ctypes as c
@@ -15,17 +14,18 @@ import re
 import time
 from collections import deque
 from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
+import numpy.typing as npt
 
 from rig_agent.sources import libfreenect as fn
 from rig_agent.sources.base import SourceLost
 from rig_agent.sources.frame_pairing import Stream, StreamImage
+from rig_agent.sources.freenect_formats import ImageFormat
 from rig_protocol.errors import RigError
-from rig_protocol.frames import ImageU16
 from rig_protocol.troubleshooting import Topic
-
-WIDTH, HEIGHT = 640, 480
 
 _LIBUSB_INTERRUPTED = -10  # a signal arrived; nothing is wrong
 _PACKETS = re.compile(rb"Got (video|depth) frame .*, (\d+)/(\d+) packets")
@@ -33,6 +33,33 @@ _SHORT_PACKET = re.compile(rb"\[Stream (70|80)\] Expected ")
 _STREAM_OF_FLAG: dict[bytes, Stream] = {b"70": "depth", b"80": "video"}
 
 log = logging.getLogger(__name__)
+
+
+@dataclass(frozen=True, slots=True)
+class Switches:
+    """What a Kinect is told about its images; `depth` is None while that stream and the projector are off.
+
+    Auto exposure and white balance are the colour camera's; None for what stays as the Kinect has it.
+    """
+
+    video: ImageFormat
+    depth: ImageFormat | None
+    auto_exposure: bool | None = None
+    auto_white_balance: bool | None = None
+    mirror: bool = False
+    near_mode: bool | None = None
+
+    @property
+    def flags(self) -> dict[int, bool]:
+        """libfreenect's flags for it."""
+        wanted = {
+            fn.FLAG_AUTO_EXPOSURE: self.auto_exposure,
+            fn.FLAG_AUTO_WHITE_BALANCE: self.auto_white_balance,
+            fn.FLAG_MIRROR_VIDEO: self.mirror,
+            fn.FLAG_MIRROR_DEPTH: None if self.depth is None else self.mirror,
+            fn.FLAG_NEAR_MODE: self.near_mode,
+        }
+        return {flag: on for flag, on in wanted.items() if on is not None}
 
 
 class DamageReport:
@@ -70,31 +97,50 @@ class FreenectDevice:
     def __init__(self, library: c.CDLL, index: int, on_image: Callable[[StreamImage], None]) -> None:
         """Open the `index`-th camera; SourceLost with libfreenect's own words when it fails."""
         self._library = library
-        self._on_image = on_image
         self.damage = DamageReport()
         self._errors: deque[str] = deque(maxlen=3)
-        self._depth_buffer = _depth_buffer()
-        # ctypes keeps no reference to callbacks that C code holds.
-        self._callbacks = (
-            fn.LOG_CALLBACK(self._on_log),
-            fn.FRAME_CALLBACK(self._on_video),
-            fn.FRAME_CALLBACK(self._on_depth),
-        )
+        self._log_callback = fn.LOG_CALLBACK(self._on_log)  # ctypes keeps no reference to what C code holds
         self._context, self._device = c.c_void_p(), c.c_void_p()
         try:
             self._open(index)
         except RigError:
             self.close()
             raise
+        self._flags: dict[int, bool] = {}  # as the Kinect has them, as far as it was told
+        self._streams = {
+            stream: _ImageStream(library, self._device, stream, self.damage.is_damaged, on_image)
+            for stream in ("video", "depth")
+        }
 
-    def start(self) -> None:
-        """Begin to stream; SourceLost when the camera refuses."""
-        _, on_video, on_depth = self._callbacks
-        self._library.freenect_set_depth_buffer(self._device, self._depth_buffer.ctypes.data)
-        self._library.freenect_set_depth_callback(self._device, on_depth)
-        self._library.freenect_set_video_callback(self._device, on_video)
-        self._check(self._library.freenect_start_depth(self._device), "start depth")
-        self._check(self._library.freenect_start_video(self._device), "start colour")
+    def switch(self, switches: Switches) -> bool:
+        """Start, stop and set what differs from how it is; False when a flag was not taken.
+
+        A stream that goes on is not disturbed, whatever happens to the other one. SourceLost when the camera
+        does not start or stop one.
+        """
+        self._errors.clear()
+        wanted: dict[Stream, ImageFormat | None] = {"depth": switches.depth, "video": switches.video}
+        # Infrared in high resolution is refused while depth is on: first all stops, then all starts.
+        for stream, form in wanted.items():
+            if self._streams[stream].form not in (None, form):
+                self._check(self._streams[stream].stop(), f"stop {stream}")
+        for stream, form in wanted.items():
+            if form is not None and self._streams[stream].form is None:
+                self._check(self._streams[stream].start(form), f"start {stream}")
+                # A stream starts unmirrored.
+                self._flags[fn.FLAG_MIRROR_VIDEO if stream == "video" else fn.FLAG_MIRROR_DEPTH] = False
+        if self._errors:  # libfreenect starts and stops without regard to commands that failed: its log tells
+            self._check(-1, "switch its streams")
+        changed = {flag: on for flag, on in switches.flags.items() if self._flags.get(flag) != on}
+        refused = [flag for flag, on in changed.items() if not self._set_flag(flag, on)]
+        return not refused
+
+    def restart(self, switches: Switches) -> bool:
+        """Stop both streams and start them anew; results are those of `switch`."""
+        for stream in self._streams.values():
+            if stream.form is not None:
+                stream.stop()
+        return self.switch(switches)
 
     def process(self, timeout_s: float) -> None:
         """Wait for packets and deliver what is complete; SourceLost when the device is gone."""
@@ -122,36 +168,25 @@ class FreenectDevice:
     def _open(self, index: int) -> None:
         library = self._library
         self._check(library.freenect_init(c.byref(self._context), None), "start libfreenect")
-        library.freenect_set_log_callback(self._context, self._callbacks[0])
+        library.freenect_set_log_callback(self._context, self._log_callback)
         library.freenect_set_log_level(self._context, fn.LOG_SPEW)
         library.freenect_select_subdevices(self._context, fn.DEVICE_CAMERA)
         self._check(library.freenect_open_device(self._context, c.byref(self._device), index), "open")
-        video = library.freenect_find_video_mode(fn.RESOLUTION_MEDIUM, fn.VIDEO_BAYER)
-        depth = library.freenect_find_depth_mode(fn.RESOLUTION_MEDIUM, fn.DEPTH_11BIT)
-        if (video.bytes, depth.bytes) != (WIDTH * HEIGHT, 2 * WIDTH * HEIGHT):
-            raise RigError(
-                "this libfreenect offers no 640×480 Bayer and 11-bit depth: use libfreenect 0.5",
-                Topic.MISSING_LIBRARY,
-            )
-        self._check(library.freenect_set_video_mode(self._device, video), "choose Bayer")
-        self._check(library.freenect_set_depth_mode(self._device, depth), "choose 11-bit depth")
+
+    def _set_flag(self, flag: int, on: bool) -> bool:
+        """False for one that the Kinect does not take, which is no reason to do without its images."""
+        set_flag = getattr(self._library, "freenect_set_flag", None)
+        if set_flag is not None and set_flag(self._device, flag, on) >= 0:  # success may be any of these
+            self._flags[flag] = on
+            return True
+        log.warning("the Kinect does not take flag %#x = %d", flag, on)
+        self._flags.setdefault(flag, on)  # what was refused at the start is not asked for at every switch
+        return False
 
     def _check(self, result: int, what: str) -> None:
         if result < 0:
             said = "; ".join(self._errors) or f"error {result}"
             raise SourceLost(f"libfreenect cannot {what}: {said}")
-
-    def _on_depth(self, _device: int, _data: int, ticks: int) -> None:
-        arrival_ns = time.monotonic_ns()
-        image, self._depth_buffer = self._depth_buffer, _depth_buffer()
-        self._library.freenect_set_depth_buffer(self._device, self._depth_buffer.ctypes.data)
-        self._on_image(StreamImage("depth", ticks, arrival_ns, image, self.damage.is_damaged("depth")))
-
-    def _on_video(self, _device: int, data: int, ticks: int) -> None:
-        arrival_ns = time.monotonic_ns()
-        borrowed = (c.c_uint8 * (WIDTH * HEIGHT)).from_address(data)
-        image = np.ctypeslib.as_array(borrowed).reshape(HEIGHT, WIDTH).copy()
-        self._on_image(StreamImage("video", ticks, arrival_ns, image, self.damage.is_damaged("video")))
 
     def _on_log(self, _context: int, level: int, line: bytes) -> None:
         if level >= fn.LOG_SPEW:
@@ -164,5 +199,62 @@ class FreenectDevice:
         log.log(logging.WARNING if level <= fn.LOG_WARNING else logging.DEBUG, "libfreenect: %s", text)
 
 
-def _depth_buffer() -> ImageU16:
-    return np.empty((HEIGHT, WIDTH), np.uint16)
+class _ImageStream:
+    """Colour or depth of an open device, in one format at a time."""
+
+    def __init__(
+        self,
+        library: c.CDLL,
+        device: c.c_void_p,
+        stream: Stream,
+        is_damaged: Callable[[Stream], bool],
+        on_image: Callable[[StreamImage], None],
+    ) -> None:
+        self.form: ImageFormat | None = None  # None while it is stopped
+        self._device, self._stream = device, stream
+        self._is_damaged, self._on_image = is_damaged, on_image
+        self._find_mode = getattr(library, f"freenect_find_{stream}_mode")
+        self._set_mode = getattr(library, f"freenect_set_{stream}_mode")
+        self._set_buffer = getattr(library, f"freenect_set_{stream}_buffer")
+        self._start = getattr(library, f"freenect_start_{stream}")
+        self._stop = getattr(library, f"freenect_stop_{stream}")
+        self._callback = fn.FRAME_CALLBACK(self._on_frame)
+        getattr(library, f"freenect_set_{stream}_callback")(device, self._callback)
+        self._buffer: npt.NDArray[Any] | None = None
+
+    def start(self, form: ImageFormat) -> int:
+        """Libfreenect's result; RigError when it does not know the format."""
+        mode = self._find_mode(form.resolution, form.code)
+        if not mode.is_valid or mode.bytes != form.bytes:
+            raise RigError(
+                f"libfreenect has no {self._stream} of {form.bytes} bytes: use libfreenect 0.5",
+                Topic.MISSING_LIBRARY,
+            )
+        self._buffer = form.empty() if form.converted else None
+        # Of the format before it, a buffer may be left that is too small: libfreenect would write on.
+        self._set_buffer(self._device, None if self._buffer is None else self._buffer.ctypes.data)
+        result: int = self._set_mode(self._device, mode)
+        if result >= 0:
+            result = self._start(self._device)
+        if result >= 0:
+            self.form = form
+        return result
+
+    def stop(self) -> int:
+        """Libfreenect's result."""
+        self.form = None
+        result: int = self._stop(self._device)
+        return result
+
+    def _on_frame(self, _device: int, data: int, ticks: int) -> None:
+        arrival_ns, form = time.monotonic_ns(), self.form
+        if form is None:
+            return  # an image that was complete when the stream stopped
+        if self._buffer is None:
+            borrowed = (c.c_uint8 * form.bytes).from_address(data)
+            image = form.empty()
+            image.reshape(-1).view(np.uint8)[:] = np.ctypeslib.as_array(borrowed)
+        else:
+            image, self._buffer = self._buffer, form.empty()
+            self._set_buffer(self._device, self._buffer.ctypes.data)
+        self._on_image(StreamImage(self._stream, ticks, arrival_ns, image, self._is_damaged(self._stream)))

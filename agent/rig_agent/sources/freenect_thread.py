@@ -6,12 +6,15 @@ its calls therefore happen on this thread, and everybody else waits for it with 
 
 import ctypes
 import logging
+import queue
 import threading
 from collections import deque
+from collections.abc import Callable
+from concurrent.futures import Future
 
 from rig_agent.sources.base import SourceLost
 from rig_agent.sources.frame_pairing import FramePairer, ImagePair, StreamImage
-from rig_agent.sources.freenect_device import FreenectDevice
+from rig_agent.sources.freenect_device import FreenectDevice, Switches
 from rig_agent.sources.libfreenect import ZeroPlane
 from rig_protocol.errors import RigError
 from rig_protocol.troubleshooting import Topic
@@ -23,11 +26,13 @@ _POLL_S = 0.1
 
 log = logging.getLogger(__name__)
 
+_Order = Callable[[FreenectDevice], bool]
+
 
 class FreenectThread:
     """Opens the `index`-th Kinect on a thread of its own and streams until stopped or lost."""
 
-    def __init__(self, library: ctypes.CDLL, index: int) -> None:
+    def __init__(self, library: ctypes.CDLL, index: int, switches: Switches) -> None:
         """Start the thread; `wait_until_open` says how it went."""
         self._changed = threading.Condition()
         self._pairs: deque[ImagePair] = deque()
@@ -38,8 +43,9 @@ class FreenectThread:
         self._stopping = False
         self._overrun = 0
         self._device: FreenectDevice | None = None
+        self._orders: queue.SimpleQueue[tuple[_Order, Future[bool]]] = queue.SimpleQueue()
         self._thread = threading.Thread(
-            target=self._run, args=(library, index), name="freenect", daemon=True
+            target=self._run, args=(library, index, switches), name="freenect", daemon=True
         )  # a daemon, because a thread that hangs in libfreenect must not keep the program alive
         self._thread.start()
 
@@ -75,34 +81,71 @@ class FreenectThread:
                 raise self._error
             return None
 
+    def switch(self, switches: Switches, timeout_s: float, restart: bool = False) -> bool:
+        """Make the streams so, or all of them anew, and forget the images before; False as the device.
+
+        SourceLost when the device does not come along within the limit.
+        """
+
+        def order(device: FreenectDevice) -> bool:
+            taken = (device.restart if restart else device.switch)(switches)
+            self._pairer.start_anew(with_depth=switches.depth is not None)
+            with self._changed:
+                self._pairs.clear()
+            return taken
+
+        done: Future[bool] = Future()
+        with self._changed:
+            if self._error:
+                raise self._error
+            self._orders.put((order, done))
+        try:
+            return done.result(timeout_s)
+        except TimeoutError as error:
+            raise SourceLost(
+                f"the camera did not answer within {timeout_s:g} s", Topic.HANGING_KINECT
+            ) from error
+
     def stop(self, timeout_s: float) -> bool:
         """Ask the thread to close the device; False when it is still in libfreenect after the limit."""
         self._stopping = True
         self._thread.join(timeout_s)
         return not self._thread.is_alive()
 
-    def _run(self, library: ctypes.CDLL, index: int) -> None:
+    def _run(self, library: ctypes.CDLL, index: int, switches: Switches) -> None:
         try:
-            self._stream(library, index)
+            self._stream(library, index, switches)
         except RigError as error:
             self._fail(error)
         except Exception as error:  # a thread's last words would otherwise be lost
             log.exception("the thread of libfreenect failed")
             self._fail(RigError(f"the thread of libfreenect failed: {error!r}"))
 
-    def _stream(self, library: ctypes.CDLL, index: int) -> None:
+    def _stream(self, library: ctypes.CDLL, index: int, switches: Switches) -> None:
         device = FreenectDevice(library, index, self._on_image)
         try:
             self._device = device
-            device.start()
+            self._pairer.start_anew(with_depth=switches.depth is not None)
+            device.switch(switches)
             with self._changed:
                 self._zero_plane = device.zero_plane()
                 self._open = True
                 self._changed.notify_all()
             while not self._stopping:
                 device.process(_POLL_S)
+                self._obey(device)
         finally:
             device.close()
+
+    def _obey(self, device: FreenectDevice) -> None:
+        while not self._orders.empty():
+            order, done = self._orders.get()
+            try:
+                taken = order(device)
+            except RigError as error:
+                done.set_exception(error)
+                raise
+            done.set_result(taken)
 
     def _on_image(self, image: StreamImage) -> None:
         pair = self._pairer.add(image)
@@ -118,4 +161,6 @@ class FreenectThread:
     def _fail(self, error: RigError) -> None:
         with self._changed:
             self._error = error
+            while not self._orders.empty():
+                self._orders.get()[1].set_exception(error)
             self._changed.notify_all()

@@ -10,9 +10,11 @@ from typing import Any, NamedTuple
 from rig_protocol.errors import ConfigurationError
 from rig_protocol.troubleshooting import Topic
 
-RESOLUTION_MEDIUM = 1
-VIDEO_BAYER = 1
-DEPTH_11BIT = 0
+RESOLUTION_MEDIUM, RESOLUTION_HIGH = 1, 2
+VIDEO_RGB, VIDEO_BAYER, VIDEO_IR_8BIT = 0, 1, 2
+DEPTH_11BIT, DEPTH_11BIT_PACKED = 0, 2
+FLAG_AUTO_WHITE_BALANCE, FLAG_AUTO_EXPOSURE = 1 << 1, 1 << 14
+FLAG_MIRROR_DEPTH, FLAG_MIRROR_VIDEO, FLAG_NEAR_MODE = 1 << 16, 1 << 17, 1 << 18
 DEVICE_CAMERA = 2
 LOG_ERROR, LOG_WARNING, LOG_SPEW = 1, 2, 6
 
@@ -87,14 +89,16 @@ _SIGNATURES: dict[str, tuple[Any, list[Any]]] = {
     "freenect_set_depth_mode": (c.c_int, [_DEVICE, FrameMode]),
     "freenect_set_video_callback": (None, [_DEVICE, FRAME_CALLBACK]),
     "freenect_set_depth_callback": (None, [_DEVICE, FRAME_CALLBACK]),
+    "freenect_set_video_buffer": (c.c_int, [_DEVICE, c.c_void_p]),
     "freenect_set_depth_buffer": (c.c_int, [_DEVICE, c.c_void_p]),
     "freenect_start_video": (c.c_int, [_DEVICE]),
     "freenect_start_depth": (c.c_int, [_DEVICE]),
     "freenect_stop_video": (c.c_int, [_DEVICE]),
     "freenect_stop_depth": (c.c_int, [_DEVICE]),
 }
-# fakenect and old versions lack these; without them the factory data is unknown.
+# fakenect and old versions lack these; without them the factory data is unknown, and flags stay as they are.
 _OPTIONAL_SIGNATURES: dict[str, tuple[Any, list[Any]]] = {
+    "freenect_set_flag": (c.c_int, [_DEVICE, c.c_int, c.c_int]),
     "freenect_copy_registration": (RegistrationStruct, [_DEVICE]),
     "freenect_destroy_registration": (c.c_int, [c.POINTER(RegistrationStruct)]),
 }

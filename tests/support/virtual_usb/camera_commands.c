@@ -15,11 +15,13 @@ enum command {
 };
 
 enum camera_register {
-    VIDEO_STREAM = 0x05,     /* 0 off, 1 colour */
+    VIDEO_STREAM = 0x05,     /* 0 off, 1 colour, 3 infrared */
     DEPTH_STREAM = 0x06,     /* 0 off, 2 depth */
     VIDEO_FORMAT = 0x0c,     /* 0 Bayer */
-    VIDEO_RESOLUTION = 0x0d, /* 1 640x480 */
+    VIDEO_RESOLUTION = 0x0d, /* 1 640x480, 2 1280x1024 */
     DEPTH_FORMAT = 0x12,     /* 3 11 bit */
+    IR_FORMAT = 0x19,        /* 0 10 bit packed */
+    IR_RESOLUTION = 0x1a,    /* 1 640x488, 2 1280x1024 */
 };
 
 #define HEADER 8
@@ -39,25 +41,45 @@ static void put16(uint8_t *bytes, unsigned value)
     bytes[1] = (uint8_t)(value >> 8);
 }
 
+/* A stream of a kind that this camera does not speak stays off. */
+static void switch_video(struct kinect *kinect, unsigned value)
+{
+    const uint16_t *registers = kinect->registers;
+    bool infrared = value == 3;
+    unsigned format = registers[infrared ? IR_FORMAT : VIDEO_FORMAT];
+    unsigned resolution = registers[infrared ? IR_RESOLUTION : VIDEO_RESOLUTION];
+    stream_stop(kinect, VIDEO);
+    if ((value == 1 || infrared) && format == 0 && (resolution == 1 || resolution == 2)) {
+        enum image_kind medium = infrared ? IR : BAYER, high = infrared ? IR_HIGH : BAYER_HIGH;
+        stream_start(kinect, VIDEO, resolution == 2 ? high : medium);
+    }
+}
+
+static void switch_depth(struct kinect *kinect, unsigned value)
+{
+    stream_stop(kinect, DEPTH);
+    if (value == 2 && kinect->registers[DEPTH_FORMAT] == 3)
+        stream_start(kinect, DEPTH, DEPTH_11BIT);
+}
+
 static void write_register(struct kinect *kinect, unsigned address, unsigned value)
 {
-    uint16_t *registers = kinect->registers;
     kinect_log(kinect, "register %04x=%04x", address, value);
-    registers[address % REGISTERS] = (uint16_t)value;
-    bool bayer = registers[VIDEO_FORMAT] == 0 && registers[VIDEO_RESOLUTION] == 1;
-    bool eleven_bit = registers[DEPTH_FORMAT] == 3;
+    kinect->registers[address % REGISTERS] = (uint16_t)value;
     if (address == VIDEO_STREAM)
-        stream_switch(kinect, VIDEO, value == 1 && bayer);
+        switch_video(kinect, value);
     if (address == DEPTH_STREAM)
-        stream_switch(kinect, DEPTH, value == 2 && eleven_bit);
+        switch_depth(kinect, value);
 }
 
 static int cmos_register(struct kinect *kinect, const uint8_t *arguments, uint8_t *answer)
 {
     unsigned address = get16(arguments + 2);
     uint16_t *cell = &kinect->cmos[address % REGISTERS];
-    if (address & CMOS_WRITE)
+    if (address & CMOS_WRITE) {
         *cell = (uint16_t)get16(arguments + 4);
+        kinect_log(kinect, "cmos %04x=%04x", address & ~CMOS_WRITE, *cell);
+    }
     put16(answer, 1);
     put16(answer + 2, address);
     put16(answer + 4, *cell);
@@ -121,6 +143,8 @@ void camera_command(struct kinect *kinect, const uint8_t *request, int length)
     put16(reply + 2, (unsigned)answered / 2);
     memcpy(reply + 4, request + 4, 4); /* command and tag come back */
     kinect->reply_length = HEADER + answered;
+    if (kinect->faults.deaf_sensor && get16(request + 4) == CMOS_REGISTER)
+        reply[4] ^= 0xff; /* the answer to no command */
 }
 
 /* The reply to the last command, once; 0 bytes when there is none. */

@@ -2,7 +2,8 @@
  *
  * Both streams share the device's frame grid, so that colour and depth of one frame number belong
  * together. The packets of a frame fill the first 30.4 ms of its interval: depth one in every
- * microframe, colour two in every three.
+ * microframe, colour two in every three. A large image takes one packet in every microframe, and so
+ * several intervals.
  */
 #include "virtual_usb.h"
 
@@ -17,31 +18,36 @@ struct layout {
     int payload;  /* bytes of a full packet */
     int packets;  /* of a frame */
     uint8_t flag; /* marks the stream in each packet's header */
+    int intervals; /* of the bus' frame rate */
     int packets_in_group, slots_in_group;
 };
 
-static const struct layout LAYOUTS[STREAMS] = {
-    [VIDEO] = {640 * 480, 1908, 162, 0x80, 2, 3},
-    [DEPTH] = {640 * 480 * 11 / 8, 1748, 242, 0x70, 1, 1},
+static const struct layout LAYOUTS[IMAGE_KINDS] = {
+    [BAYER] = {640 * 480, 1908, 162, 0x80, 1, 2, 3},
+    [BAYER_HIGH] = {1280 * 1024, 1908, 687, 0x80, 3, 1, 1},
+    [IR] = {640 * 488 * 10 / 8, 1908, 205, 0x80, 1, 1, 1},
+    [IR_HIGH] = {1280 * 1024 * 10 / 8, 1908, 859, 0x80, 4, 1, 1},
+    [DEPTH_11BIT] = {640 * 480 * 11 / 8, 1748, 242, 0x70, 1, 1, 1},
 };
 
-size_t stream_frame_bytes(enum stream_id id) { return LAYOUTS[id].frame_bytes; }
+size_t image_bytes(enum image_kind kind) { return LAYOUTS[kind].frame_bytes; }
 
-void stream_switch(struct kinect *kinect, enum stream_id id, bool on)
+void stream_start(struct kinect *kinect, enum stream_id id, enum image_kind kind)
 {
-    kinect->streams[id].on = on;
-    kinect->streams[id].on_since_slot = kinect_slot(kinect);
+    struct stream *stream = &kinect->streams[id];
+    stream->on = true;
+    stream->kind = kind;
+    stream->on_since_slot = kinect_slot(kinect);
 }
 
-static int64_t first_slot(const struct bus *bus, int64_t frame)
-{
-    return (frame * bus->frame_ns + SLOT_NS - 1) / SLOT_NS;
-}
+void stream_stop(struct kinect *kinect, enum stream_id id) { kinect->streams[id].on = false; }
 
-static int64_t frame_at(const struct bus *bus, int64_t slot)
+static int64_t first_slot(int64_t frame_ns, int64_t frame) { return (frame * frame_ns + SLOT_NS - 1) / SLOT_NS; }
+
+static int64_t frame_at(int64_t frame_ns, int64_t slot)
 {
-    int64_t frame = slot * SLOT_NS / bus->frame_ns;
-    return first_slot(bus, frame) > slot ? frame - 1 : frame;
+    int64_t frame = slot * SLOT_NS / frame_ns;
+    return first_slot(frame_ns, frame) > slot ? frame - 1 : frame;
 }
 
 /* The packet of a frame that starts `slot` microframes into it, or -1. */
@@ -75,11 +81,12 @@ static void put_header(uint8_t *header, uint8_t flag, uint8_t sequence, uint32_t
 /* Write the packet that crosses the bus in this microframe; its length, or 0 for an empty one. */
 int stream_packet(struct kinect *kinect, enum stream_id id, int64_t slot, uint8_t *packet, int size)
 {
-    const struct layout *layout = &LAYOUTS[id];
     const struct stream *stream = &kinect->streams[id];
-    const struct frame_file *file = &kinect->frames[id];
-    int64_t frame = frame_at(kinect->bus, slot);
-    int64_t frame_slot = first_slot(kinect->bus, frame);
+    const struct layout *layout = &LAYOUTS[stream->kind];
+    const struct frame_file *file = &kinect->frames[stream->kind];
+    int64_t frame_ns = kinect->bus->frame_ns * layout->intervals;
+    int64_t frame = frame_at(frame_ns, slot);
+    int64_t frame_slot = first_slot(frame_ns, frame);
     int number = packet_in_slot(layout, slot - frame_slot);
     if (!stream->on || frame_slot < stream->on_since_slot || number < 0 || !file->frames)
         return 0;

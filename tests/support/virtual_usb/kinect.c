@@ -18,6 +18,11 @@
 #define DEFAULT_FPS 30.0
 #define NO_BUS "/nonexistent"
 
+static const char *const FRAME_FILES[IMAGE_KINDS] = {
+    [BAYER] = "bayer.bin",   [BAYER_HIGH] = "bayer_high.bin", [IR] = "ir.bin",
+    [IR_HIGH] = "ir_high.bin", [DEPTH_11BIT] = "depth11.bin",
+};
+
 static pthread_mutex_t lock = PTHREAD_MUTEX_INITIALIZER;
 static struct bus *buses;
 
@@ -137,7 +142,7 @@ static void firmware_start(struct kinect *kinect)
     memset(kinect->cmos, 0, sizeof kinect->cmos);
     kinect->reply_length = 0;
     for (int id = 0; id < STREAMS; id++)
-        kinect->streams[id].on = false;
+        stream_stop(kinect, id);
 }
 
 static void power_on(struct kinect *kinect, uint64_t identity)
@@ -154,8 +159,8 @@ static void power_on(struct kinect *kinect, uint64_t identity)
     kinect->model = model_of(line);
     kinect_read_line(kinect, "first_tick", line, sizeof line);
     kinect->first_tick = (uint32_t)strtoul(line, NULL, 0);
-    frame_file_map(&kinect->frames[VIDEO], kinect_path(kinect, "bayer.bin"), stream_frame_bytes(VIDEO));
-    frame_file_map(&kinect->frames[DEPTH], kinect_path(kinect, "depth11.bin"), stream_frame_bytes(DEPTH));
+    for (int kind = 0; kind < IMAGE_KINDS; kind++)
+        frame_file_map(&kinect->frames[kind], kinect_path(kinect, FRAME_FILES[kind]), image_bytes(kind));
     for (int id = 0; id < STREAMS; id++)
         kinect->streams[id].pending = 0;
     firmware_start(kinect);
@@ -170,6 +175,7 @@ static void read_faults(struct kinect *kinect)
     faults->busy = has(kinect, "busy");
     faults->mute = has(kinect, "mute");
     faults->mute_motor = has(kinect, "mute_motor");
+    faults->deaf_sensor = has(kinect, "deaf_sensor");
     faults->stall = has(kinect, "stall");
     kinect_read_line(kinect, "lose", line, sizeof line);
     faults->lose_percent = atof(line);

@@ -4,11 +4,14 @@ A bus is a folder with one numbered folder (0 to 7) for each Kinect. In it, the 
     present                            exists while the Kinect is plugged in
     serial, model                      model is 1414, 1473 or k4w
     bayer.bin, depth11.bin             frames, looped: 640×480 GRBG bytes; 640×480 packed 11-bit values
+    ir.bin, bayer_high.bin, ir_high.bin   likewise, where a test wants them: 640×488 packed 10-bit values of
+                                       infrared; 1280×1024 of either, at a third and a fourth of the rate
     accel                              "x y z tilt status" in counts (819 a g)
     first_tick                         the 60-MHz clock at power-on
     deny, busy, mute, stall            faults: no permission; claimed by another program; never answers
                                        (a USB reset cures it); sends no images
     mute_motor                         fault: the motor, and so the accelerometer, never answers
+    deaf_sensor                        fault: the colour sensor takes no exposure and white balance
     lose                               percent of image packets lost at random
     lose_video_packet, …_depth_…       "p n": packet p of every n-th frame is lost
 and the library appends to `log` what the driver commanded. Environment: VKINECT_DIR is the bus,
@@ -50,7 +53,7 @@ class KinectFrames:
     @functools.cached_property
     def packed_raw(self) -> bytes:
         """The depth images as the sensor sends them."""
-        return pack_11bit(self.raw)
+        return pack_bits(self.raw, bits=11)
 
     def index_of(self, raw: npt.NDArray[np.uint16]) -> int | None:
         """Which frame this depth image is, byte for byte."""
@@ -66,6 +69,28 @@ def kinect_frames() -> KinectFrames:
     # An even shift keeps the mosaic's phase, and tells the frames apart.
     bayer = [np.roll(_mosaic_grbg(color), 2 * i, axis=1) for i in range(len(raw))]
     return KinectFrames(np.stack(bayer), np.stack(raw).astype(np.uint16))
+
+
+@dataclass(frozen=True)
+class InfraredFrames:
+    """Infrared images that a virtual Kinect loops: ten bits a pixel, the upper eight as given here."""
+
+    grey: npt.NDArray[np.uint8]  # (N,488,640)
+    high: npt.NDArray[np.uint8]  # (N,1024,1280)
+
+    def write(self, kinect: "VirtualKinect") -> None:
+        """Before the Kinect is plugged in."""
+        for name, images in (("ir.bin", self.grey), ("ir_high.bin", self.high)):
+            (kinect.folder / name).write_bytes(pack_bits(images.astype(np.uint16) << 2, bits=10))
+
+
+@functools.cache
+def infrared_frames() -> InfraredFrames:
+    """Noise, no two images alike."""
+    random = np.random.default_rng(0)
+    return InfraredFrames(
+        random.integers(0, 256, (3, 488, 640), np.uint8), random.integers(0, 256, (2, 1024, 1280), np.uint8)
+    )
 
 
 class VirtualKinect:
@@ -169,10 +194,10 @@ def library() -> Path:
     return built
 
 
-def pack_11bit(raw: npt.NDArray[np.uint16]) -> bytes:
-    """As the sensor sends it: 11 bits a pixel, most significant first, no padding."""
-    bits = np.unpackbits(raw.astype(">u2").view(np.uint8).reshape(-1, 2), axis=1)
-    return np.packbits(bits[:, 5:]).tobytes()
+def pack_bits(values: npt.NDArray[np.uint16], bits: int) -> bytes:
+    """As the sensor sends them: so many bits a pixel, most significant first, no padding."""
+    unpacked = np.unpackbits(values.astype(">u2").view(np.uint8).reshape(-1, 2), axis=1)
+    return np.packbits(unpacked[:, 16 - bits :]).tobytes()
 
 
 def _compile(sources: list[Path], include: str, target: Path) -> None:

@@ -28,6 +28,7 @@
 enum model { MODEL_1414, MODEL_1473, MODEL_K4W };
 enum function { CAMERA, MOTOR, AUDIO, HUB, FUNCTIONS };
 enum stream_id { VIDEO, DEPTH, STREAMS };
+enum image_kind { BAYER, BAYER_HIGH, IR, IR_HIGH, DEPTH_11BIT, IMAGE_KINDS };
 
 struct kinect;
 struct bus;
@@ -55,6 +56,7 @@ struct frame_file {
 
 struct stream {
     bool on;
+    enum image_kind kind;
     int64_t on_since_slot;
     int pending;            /* transfers submitted and not yet completed */
     int64_t next_free_slot; /* the slots of pending transfers end here */
@@ -66,6 +68,7 @@ struct faults {
     bool busy;                /* another program has claimed the camera */
     bool mute;                /* the camera never answers control transfers; a reset cures it */
     bool mute_motor;          /* the motor never answers control transfers */
+    bool deaf_sensor;         /* commands to the colour sensor's registers fail */
     bool stall;               /* isochronous packets stay empty */
     double lose_percent;      /* of isochronous packets, at random */
     int lose_packet[STREAMS]; /* this packet (-1: none) ... */
@@ -98,7 +101,7 @@ struct kinect {
     uint32_t audio_command;
     uint32_t audio_tag;
 
-    struct frame_file frames[STREAMS];
+    struct frame_file frames[IMAGE_KINDS];
     struct stream streams[STREAMS];
     uint32_t random;
 };
@@ -133,9 +136,10 @@ int audio_write(struct kinect *kinect, const uint8_t *data, int size);
 int audio_read(struct kinect *kinect, uint8_t *data, int size);
 
 /* iso_stream.c */
-void stream_switch(struct kinect *kinect, enum stream_id id, bool on);
+void stream_start(struct kinect *kinect, enum stream_id id, enum image_kind kind);
+void stream_stop(struct kinect *kinect, enum stream_id id);
 int stream_packet(struct kinect *kinect, enum stream_id id, int64_t slot, uint8_t *packet, int size);
-size_t stream_frame_bytes(enum stream_id id);
+size_t image_bytes(enum image_kind kind);
 
 /* libusb_devices.c */
 struct bus *bus_of_context(libusb_context *context);

@@ -9,6 +9,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
+from dataclasses import replace
 from pathlib import Path
 from types import TracebackType
 from typing import Self
@@ -115,6 +116,24 @@ def await_true(condition: Callable[[], bool]) -> None:
     while not condition():
         assert time.monotonic() < deadline
         time.sleep(0.01)
+
+
+class SwitchedSource(FakeSource):
+    """Delivers infrared images instead of Bayer from the fourth frame to the seventh."""
+
+    def read(self, timeout_s: float) -> RgbdFrame | None:
+        frame = super().read(timeout_s)
+        if frame is not None and 3 <= frame.sequence < 7:
+            return replace(frame, bayer=None, color=np.zeros((48, 64), np.uint8))
+        return frame
+
+
+def test_images_of_another_kind_than_agreed_are_left_out_and_end_no_agent(server: LoopbackServer) -> None:
+    with running(make_settings(server), SwitchedSource) as agent:
+        server.wait_for(FrameReceived, 5)
+        await_true(lambda: agent.totals.captured > 12)
+        server.wait_for(FrameReceived, 8)
+    assert all(frame.color is not None for frame in server.frames())
 
 
 def test_frames_arrive_bit_exact_under_the_agents_slot(server: LoopbackServer) -> None:

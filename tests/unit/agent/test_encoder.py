@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from rig_agent.encoder import encode_frame
+from rig_agent.encoder import encode_frame, fits
 from rig_protocol.codecs import codec_by_name
 from rig_protocol.errors import DataError
 from rig_protocol.frames import RgbdFrame
@@ -63,6 +63,25 @@ def test_colour_and_grey_images_have_codecs_of_their_own(kind: str) -> None:
     encoded = encode_frame(RgbdFrame(0, 0, 0, color=image), wire_id(f"{kind}-lossless"), None)
     assert encoded.color is not None
     np.testing.assert_array_equal(codec_by_name(f"{kind}-lossless").decode(encoded.color.data), image)
+
+
+@pytest.mark.parametrize(
+    ("frame", "color", "depth", "fitting"),
+    [
+        (FRAME, "bayer-lossless", "disparity-lossless", True),
+        (FRAME, "bgr-jpeg", None, True),
+        (FRAME, "grey-lossless", None, False),
+        (FRAME, None, "depth-lossless", False),
+        (RgbdFrame(0, 0, 0, color=scene("grey", 48, 64)), "grey-lossless", "disparity-lossless", True),
+        (RgbdFrame(0, 0, 0, color=scene("grey", 48, 64)), "bayer-lossless", None, False),
+        (RgbdFrame(0, 0, 0, color=scene("bgr", 48, 64)), "grey-lossless", None, False),
+    ],
+)
+def test_a_frame_fits_codecs_of_its_own_kinds(
+    frame: RgbdFrame, color: str | None, depth: str | None, fitting: bool
+) -> None:
+    ids = [None if name is None else wire_id(name) for name in (color, depth)]
+    assert fits(frame, *ids) is fitting
 
 
 def test_a_codec_that_cannot_take_the_image_is_a_mistake_of_the_caller() -> None:

@@ -111,6 +111,8 @@ def test_the_list_of_controls_needs_no_server(operator: Operator, capsys: pytest
         ("depth", "On", True),
         ("tilt_deg", "-4.5", -4.5),
         ("restart", None, True),
+        ("restart", "usb", "usb"),
+        ("color", "ir", "ir"),
         ("of_a_newer_agent", "on", True),
         ("of_a_newer_agent", "3", 3.0),
         ("of_a_newer_agent", "word", "word"),

@@ -25,7 +25,7 @@ def millimetres_of_libfreenect(raw: int, plane: ZeroPlane) -> float:
 def test_the_model_is_libfreenects_conversion_in_closed_form(raw: int, plane: ZeroPlane) -> None:
     model = camera_model(plane)
     metres = model.raw_model.numerator_m / (model.raw_model.offset - raw)
-    assert model.source == "factory"
+    assert model.source == "default"
     assert metres == pytest.approx(millimetres_of_libfreenect(raw, plane) / 1000, rel=1e-12)
 
 

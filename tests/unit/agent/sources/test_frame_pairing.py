@@ -47,3 +47,20 @@ def test_an_image_that_comes_too_late_does_not_take_the_next_partner() -> None:
 def test_pairs_form_across_the_wrap_of_the_counter() -> None:
     pairs, unpaired = pairs_of(image("video", 2**32 - 100), image("depth", 100))
     assert (pairs, unpaired) == ([(100, 2**32 - 100)], 0)
+
+
+def test_while_depth_is_off_every_colour_image_stands_alone() -> None:
+    pairer = FramePairer()
+    pairer.add(image("video", 0))
+    pairer.start_anew(with_depth=False)
+    pairs = [pairer.add(image("video", number * FRAME)) for number in (1, 2)]
+    assert [(pair.depth, pair.clocked.ticks) for pair in pairs if pair] == [(None, FRAME), (None, 2 * FRAME)]
+    assert pairer.add(image("depth", 3 * FRAME)) is None, "left over from before the switch"
+    assert pairer.unpaired == 0, "switching is no fault"
+
+
+def test_images_from_before_a_switch_pair_with_none_after_it() -> None:
+    pairer = FramePairer()
+    pairer.add(image("video", 0))
+    pairer.start_anew(with_depth=True)
+    assert pairer.add(image("depth", 0)) is None
