@@ -140,6 +140,7 @@ class Capture:
                 return False
             try:
                 told(True, source.control(name, value))
+                self._on_open(source.describe())  # colour may come in another format from now on
             except SourceLost as error:
                 told(False, str(error))
                 raise

@@ -4,6 +4,7 @@ import logging
 import random
 import threading
 from collections.abc import Callable, Iterator, Mapping
+from dataclasses import replace
 from itertools import pairwise
 from types import TracebackType
 from typing import Self
@@ -12,7 +13,7 @@ import pytest
 
 from rig_agent.capture import Capture, _Thinning
 from rig_agent.frame_queue import FrameQueue
-from rig_agent.sources.base import SourceDescription, SourceLost
+from rig_agent.sources.base import ControlValue, SourceDescription, SourceLost
 from rig_protocol.camera import CameraModel
 from rig_protocol.errors import DataError
 from rig_protocol.frames import RgbdFrame
@@ -244,6 +245,30 @@ def test_what_the_server_wants_may_change_amid_the_stream() -> None:
     taken = [round(frame.timestamp_ns / INTERVAL_NS) for frame in recorder.take(75)]
     assert capture.stop(5.0)
     assert taken == [*range(30), *range(30, 60, 2), *range(60, 90)]
+
+
+def test_a_control_that_changes_what_the_source_delivers_is_told_to_the_agent() -> None:
+    infrared = replace(DESCRIPTION, color_image="grey")
+
+    class Switched(ScriptedSource):
+        description = DESCRIPTION
+
+        def describe(self) -> SourceDescription:
+            return self.description
+
+        def control(self, name: str, value: ControlValue) -> str:
+            assert (name, value) == ("color", "ir")
+            self.description = infrared
+            return "infrared from now on"
+
+    told: FrameQueue[SourceDescription] = FrameQueue(10)
+    answers: FrameQueue[tuple[bool, str]] = FrameQueue(10)
+    capture = Capture(lambda: Switched([]), None, told.put, lambda _frame: None, lambda _error: None)
+    capture.start()
+    capture.control("color", "ir", lambda done, words: answers.put((done, words)))
+    assert answers.get(5.0) == (True, "infrared from now on")
+    assert [told.get(5.0), told.get(5.0)] == [DESCRIPTION, infrared]
+    assert capture.stop(5.0)
 
 
 def test_a_full_queue_drops_the_oldest_and_counts_it() -> None:
