@@ -74,6 +74,7 @@ class RigStatus:
     place; `unread_bytes`: how much of the kernel's receive buffer is taken. `durations`: histograms since the
     start, by the names in `rig_server.durations`; `recent`: the same of the last half minute. `link`: what is
     sent and what that takes, in words. `drift`: what the drift watch says, None where nobody watches.
+    `turns`: rises while the receiver is alive, at least once a second.
     """
 
     cameras: tuple[CameraMetrics, ...]
@@ -92,6 +93,7 @@ class RigStatus:
     link: str | None = None
     drift: DriftReport | None = None
     authenticated: bool = False
+    turns: int = 0
 
     @property
     def connected(self) -> int:
