@@ -35,6 +35,7 @@ pi {pi} kinects='[{{"slot": 0}}, {{"slot": 1}}]'
 [all:vars]
 rig_server_address={address}
 rig_health_retries=15
+{checkout}
 agent_settings={{"source": "synthetic", "synthetic": {{"frames_rendered": 2, "fps": 5.0, "cameras": 2}}}}
 """
 
@@ -70,6 +71,23 @@ class Recap:
         return {host: int(n) for host, n in re.findall(r"^(\w+)\s+:.*changed=(\d+)", self.output, re.M)}
 
 
+def checkout(name: str, version: str, agent_line: str = "") -> str:
+    """A copy of the repository as a release, its agent with one more line; the variable that takes it."""
+    copy = WORK / name
+    shutil.rmtree(copy, ignore_errors=True)
+    listed = subprocess.run(
+        ["git", "ls-files", "-z"], cwd=REPOSITORY, capture_output=True, text=True, check=True
+    )
+    for file in filter(None, listed.stdout.split("\0")):
+        if (REPOSITORY / file).is_file() and not file.startswith(("tests/", "docs/")):
+            (copy / file).parent.mkdir(parents=True, exist_ok=True)
+            shutil.copy2(REPOSITORY / file, copy / file)
+    project, agent = copy / "pyproject.toml", copy / "agent/rig_agent/agent.py"
+    project.write_text(re.sub(r'^version = ".*"$', f'version = "{version}"', project.read_text(), flags=re.M))
+    agent.write_text(f"{agent.read_text()}\n{agent_line}\n")
+    return f"rig_checkout={copy}"
+
+
 class Site:
     """The PC and the Pi, and Ansible for them."""
 
@@ -79,12 +97,13 @@ class Site:
         self.machines = {name: DebianMachine(WORK / "base", WORK / name) for name in UNITS}
         self._network = network
         self._enter = write_enter(WORK / "enter")
+        self._checkout = checkout("first", "98.0")  # a copy: nobody edits it meanwhile
 
     def play(self, playbook: str, *options: str, booted: bool = False) -> Recap:
         """Run a playbook, by chroot or on the booted machines."""
         inventory = WORK / "inventory"
         ways = {name: one.connection(self._enter if booted else None) for name, one in self.machines.items()}
-        inventory.write_text(_INVENTORY.format(**ways, address=PC_ADDRESS))
+        inventory.write_text(_INVENTORY.format(**ways, address=PC_ADDRESS, checkout=self._checkout))
         words = [f"{Path(sys.executable).parent}/ansible-playbook", "-i", str(inventory), playbook, *options]
         environment = {**os.environ, "ANSIBLE_NOCOLOR": "1"}
         environment.pop("PYTHONPATH", None)
@@ -212,23 +231,6 @@ def test_a_frame_loop_that_stops_is_ended_and_started_again_by_systemd(site: Sit
     )
     assert "Watchdog timeout" in pc.run("journalctl", "--no-pager", "-u", "rig-server.service")
     wait_for_sets(site)
-
-
-def checkout(name: str, version: str, agent_line: str = "") -> str:
-    """A copy of the repository as another release, its agent with one more line; the option that takes it."""
-    copy = WORK / name
-    shutil.rmtree(copy, ignore_errors=True)
-    listed = subprocess.run(
-        ["git", "ls-files", "-z"], cwd=REPOSITORY, capture_output=True, text=True, check=True
-    )
-    for file in filter(None, listed.stdout.split("\0")):
-        if (REPOSITORY / file).is_file() and not file.startswith(("tests/", "docs/")):
-            (copy / file).parent.mkdir(parents=True, exist_ok=True)
-            shutil.copy2(REPOSITORY / file, copy / file)
-    project, agent = copy / "pyproject.toml", copy / "agent/rig_agent/agent.py"
-    project.write_text(re.sub(r'^version = ".*"$', f'version = "{version}"', project.read_text(), flags=re.M))
-    agent.write_text(f"{agent.read_text()}\n{agent_line}\n")
-    return f"rig_checkout={copy}"
 
 
 def test_an_upgrade_goes_from_machine_to_machine_and_back_again(site: Site) -> None:
