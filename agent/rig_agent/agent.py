@@ -29,6 +29,7 @@ from rig_protocol.messages import Hello
 from rig_protocol.rig_key import RigKey
 from rig_protocol.service_manager import ServiceManager
 from rig_protocol.system_clock import SystemClock
+from rig_protocol.troubleshooting import Topic, see
 
 _log = logging.getLogger(__name__)
 
@@ -118,7 +119,9 @@ class Agent:
             if is_due(health.due_ns, time_ns, health.interval_ns):
                 _log.info("%s", health.line(self.totals, self._wanted is not None, time_ns))
             if hang.lasts(self._capture.last_sign_ns, time_ns):
-                raise RigError(f"the {self._settings.source} driver hangs: start the agent anew")
+                raise RigError(
+                    f"the {self._settings.source} driver hangs: start the agent anew", Topic.HANGING_KINECT
+                )
 
     def _wait(self, time_ns: int) -> None:
         """Sleep until a datagram or a frame comes or something is due."""
@@ -134,6 +137,7 @@ class Agent:
         if hello is not None and hello is not self._introduced:
             self._introduced = hello
             self._uplink.introduce(hello, time_ns)
+        self._uplink.report_gravity(self._capture.gravity)
         # Control first: cutting a frame takes a millisecond, which the clock exchange would feel.
         self._uplink.serve(time_ns)
         self._wanted = self._uplink.wanted
@@ -148,7 +152,11 @@ class Agent:
         self._uplink.close(now_ns())
         ended = self._capture.stop(_STOP_TIMEOUT_S)
         if not ended:
-            _log.warning("the %s driver does not return; leaving without it", self._settings.source)
+            _log.warning(
+                "the %s driver does not return; leaving without it",
+                self._settings.source,
+                extra=see(Topic.HANGING_KINECT),
+            )
         self._encoder.join()
         if ended:
             os.close(self._wake)

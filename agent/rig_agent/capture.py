@@ -9,6 +9,8 @@ from dataclasses import dataclass, replace
 from rig_agent.sources.base import FrameSource, SourceDescription, SourceLost
 from rig_agent.transport import now_ns
 from rig_protocol.frames import RgbdFrame
+from rig_protocol.gravity import Gravity
+from rig_protocol.troubleshooting import see
 
 _log = logging.getLogger(__name__)
 
@@ -51,6 +53,7 @@ class Capture:
         self._thread = threading.Thread(target=self._run, name="capture", daemon=True)
         self._next_sequence = 0
         self.last_sign_ns = now_ns()
+        self.gravity: Gravity | None = None  # as the source felt it with its latest frame
         self.counters = CaptureCounters()
         self.source_counters: Mapping[
             str, int
@@ -77,11 +80,12 @@ class Capture:
             try:
                 self._run_source()
             except SourceLost as error:
+                self.gravity = None
                 self.counters.losses += 1
                 if self.counters.captured > captured:
                     retry_s, told = _FIRST_RETRY_S, ""
                 if str(error) != told:
-                    _log.warning("%s; trying again until it is back", error)
+                    _log.warning("%s; trying again until it is back", error, extra=see(error.topic))
                 told = str(error)
                 self._stopping.wait(retry_s)
                 retry_s = min(2 * retry_s, _LAST_RETRY_S)
@@ -103,6 +107,7 @@ class Capture:
                 self.source_counters = counted_before + Counter(source.counters)
                 if frame is None:
                     continue
+                self.gravity = frame.gravity
                 # A source that was opened again, or whose clock was set back, counts on where it was.
                 if offset is None or frame.sequence + offset < self._next_sequence:
                     offset = self._next_sequence - frame.sequence

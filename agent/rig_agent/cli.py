@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from rig_protocol.errors import ConfigurationError
-from rig_protocol.programs import leave_done, run_program, set_up_logging
+from rig_protocol.programs import EXIT_FAILED, leave_done, run_program, set_up_logging
 
 if TYPE_CHECKING:  # heavy: imported where they are used, so that --help is quick
     from rig_agent.config import AgentSettings
@@ -20,6 +20,8 @@ _EXAMPLES = """
 `rig-agent --source folder --path recordings/office --camera 3` — play camera 3 of a rig folder
 
 `rig-agent --source synthetic --camera 0 --seed 7` — one camera of the simulated ring
+
+`rig-agent --check` — what keeps this machine from streaming, and what mends it
 
 `rig-agent init` — write ./agent.toml, every option explained, then edit it and run `rig-agent`
 
@@ -73,6 +75,11 @@ def run(
     print_config: Annotated[
         bool, typer.Option("--print-config", help="Print the effective settings as TOML and exit.")
     ] = False,
+    check: Annotated[
+        bool,
+        typer.Option("--check", help="Look at Kinect, machine, network and server, say what mends, exit."),
+    ] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="With --check: JSON and nothing else.")] = False,
 ) -> None:
     """Stream one camera, colour and depth, to the rig server until stopped.
 
@@ -104,6 +111,11 @@ def run(
     if print_config:
         typer.echo(effective_toml(settings), nl=False)
         return
+    if check:
+        _check(settings, as_json)
+        return
+    if as_json:
+        raise ConfigurationError("--json belongs to --check")
     set_up_logging(settings.log_level)
     if truth_out is not None:
         _write_truth(truth_out, settings)
@@ -143,6 +155,25 @@ def _stream(settings: "AgentSettings") -> None:
 
     _on_signals(stop)
     agent.run()
+
+
+def _check(settings: "AgentSettings", as_json: bool) -> None:
+    """Print the doctor's findings; exit status 1 when one of them is `failed`."""
+    from rich.console import Console
+
+    from rig_agent.doctor.examination import examine
+    from rig_agent.doctor.machine import Machine
+    from rig_agent.doctor.report import passed, print_finding, summary, to_json
+
+    set_up_logging("CRITICAL")  # what the drivers would log is in the findings
+    console, findings = Console(highlight=False), []
+    for finding in examine(Machine(), settings):
+        findings.append(finding)
+        if not as_json:
+            print_finding(console, finding)
+    typer.echo(to_json(findings, settings.source) if as_json else summary(findings))
+    if not passed(findings):
+        raise typer.Exit(EXIT_FAILED)
 
 
 def _on_signals(action: Any) -> None:

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 
 from rig_protocol.datagram import DatagramBatch
 from rig_protocol.events import Address
+from rig_protocol.troubleshooting import Topic, see
 
 _log = logging.getLogger(__name__)
 
@@ -157,7 +158,9 @@ class Transport:
         self.counters.network_errors += 1
         text = _explain(error)
         if text != self._last_error:
-            _log.warning("cannot reach %s:%d: %s; trying on", *self._server, text)
+            _log.warning(
+                "cannot reach %s:%d: %s; trying on", *self._server, text, extra=see(Topic.NO_NETWORK)
+            )
             self._last_error = text
 
 

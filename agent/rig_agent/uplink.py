@@ -13,9 +13,11 @@ from rig_protocol.agent_session import is_due
 from rig_protocol.datagram import DatagramBatch
 from rig_protocol.events import AgentEvent, Connected, Disconnected, Rejected
 from rig_protocol.frames import EncodedFrame
+from rig_protocol.gravity import Gravity
 from rig_protocol.messages import Hello, StreamPlan, Welcome
 from rig_protocol.rig_key import RigKey
 from rig_protocol.system_clock import SystemClockReading
+from rig_protocol.troubleshooting import Topic, see
 
 _log = logging.getLogger(__name__)
 
@@ -114,6 +116,11 @@ class Uplink:
         """What the next heartbeats tell the server."""
         if self._link is not None:
             self._link.report_health(gauges)
+
+    def report_gravity(self, gravity: Gravity | None) -> None:
+        """Down as the camera feels it now; the next heartbeats tell the server."""
+        if self._link is not None:
+            self._link.gravity = gravity
 
     def fileno(self) -> int | None:
         """For a selector; changes when the transport opens anew."""
@@ -216,11 +223,17 @@ class Uplink:
                 _log.info("connected to %s as camera %d", self._server, welcome.camera_id)
             case Rejected(reason, text):
                 if text != self._refusal:
-                    _log.error("%s refuses this camera (%s): %s; trying on", self._server, reason.name, text)
+                    _log.error(
+                        "%s refuses this camera (%s): %s; trying on",
+                        self._server,
+                        reason.name,
+                        text,
+                        extra=see(Topic.AGENT_REFUSED),
+                    )
                 self._refusal = text
             case Disconnected(text):
                 self._pacer.clear()
-                _log.warning("lost %s: %s; trying on", self._server, text)
+                _log.warning("lost %s: %s; trying on", self._server, text, extra=see(Topic.SERVER_SILENT))
 
 
 def _grid(plan: StreamPlan) -> BurstGrid:

@@ -28,6 +28,7 @@ from rig_calib.observation_model import (
 )
 from rig_calib.rotations import rotation_matrices
 from rig_protocol.camera import Intrinsics
+from rig_protocol.gravity import KINECT_SIGMA_DEG
 from rig_protocol.poses import Pose
 
 Array = npt.NDArray[np.float64]
@@ -70,7 +71,7 @@ class AdjustedCamera:
     pose_sigma: Array | None = None
     fixed_pose: bool = False
     gravity: Array | None = None
-    gravity_sigma: float = float(np.deg2rad(0.5))
+    gravity_sigma: float = float(np.deg2rad(KINECT_SIGMA_DEG))
 
     def sigma_beside_pose(self) -> Array:
         """Standard deviations (S−6,) in the order of `CameraState.beside_pose`."""

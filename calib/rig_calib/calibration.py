@@ -108,7 +108,7 @@ def calibrate(
         loop_closure=_loop_closure(solution),
         seconds=stages.seconds(),
         frames_used=max((len(view.color) for view in views), default=0),
-        provenance={"settings": settings.model_dump(mode="json")},
+        provenance={"settings": settings.model_dump(mode="json"), **_gravity(solution)},
         warnings=tuple(warnings),
         failures=tuple(failures),
         joint_covariance=None
@@ -250,6 +250,13 @@ def _calibrated_cameras(views: Sequence[CameraView], solution: _Solution) -> tup
         for view in views
         if view.camera_id in solution.poses
     )
+
+
+def _gravity(solution: _Solution) -> dict[str, list[int]]:
+    """For the provenance: which cameras' accelerometers the adjustment has heard."""
+    cameras = () if solution.rig is None else solution.rig.scene.cameras
+    felt = [c for c in cameras if solution.cameras[c].view.gravity is not None]
+    return {"gravity_cameras": felt} if felt else {}
 
 
 def _placed(views: Sequence[CameraView], solution: _Solution) -> list[int]:

@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import typer
 
 from rig_protocol.programs import run_program, set_up_logging
+from rig_protocol.troubleshooting import Topic
 
 if TYPE_CHECKING:  # heavy: imported where they are used, so that --help is quick
     from rig_calib.rig_calibration import RigCalibration
@@ -97,7 +98,10 @@ def solve(
     if as_json:
         _print_json(result.calibration.to_dict())
     if result.calibration.failures:
-        raise RigError("the calibration fails its gate: " + "; ".join(result.calibration.failures))
+        raise RigError(
+            "the calibration fails its gate: " + "; ".join(result.calibration.failures),
+            Topic.CALIBRATION_REFUSED,
+        )
 
 
 @app.command()
@@ -180,7 +184,7 @@ def check(
     if result.unknown:
         told.append(unknown_message(result.unknown, names))
     if told:
-        raise RigError("; ".join(told))
+        raise RigError("; ".join(told), Topic.CAMERA_MOVED)
 
 
 @app.command()

@@ -1,6 +1,7 @@
 """The joint estimate: poses, points and what is wrong with every camera in one adjustment, on patches.
 
-Keypoints start it. Then patches are looked for where the poses predict them, and again while the poses move.
+Keypoints start it. Then patches are looked for where the poses predict them, and again while the poses move;
+where a pair is left that is known too little, walls and floor that cameras share join them.
 Pairs that only the drawing predicts are led by depth first, with noise that goes down to what it is.
 """
 
@@ -20,6 +21,7 @@ from rig_calib.refinement import RefinedRig, refine
 from rig_calib.registration import ransac
 from rig_calib.rig_adjustment import AT_REST, AdjustedRig, adjust_rig
 from rig_calib.settings import CalibrationSettings
+from rig_calib.shared_planes import NOTHING_SHARED, find_shared_planes
 from rig_calib.uncertainty import weakest_direction
 from rig_protocol.poses import Pose, inverse, rotation_angle_deg
 from rig_protocol.rig_folder import RingDrawing
@@ -37,6 +39,9 @@ _GRADUATED_NOISE = tuple(
     for pixels, steps in ((1.0, 4.0), (1.0, 2.0), (1.0, 1.0), (1.0, 0.5), (1.0, 0.3), (0.3, 0.15))
 )
 _FAR_AND_WIDE_PX = 4.0  # predictions worse than this find false places, too
+# This share of what has texture must look alike in the other camera, or the place is a wrong one: 0.30-0.60
+# was seen there, 0.66-0.93 at right places (simulated rooms without patterns).
+_LEAST_FOUND_SHARE = 0.63
 # Fewer patches that were found far from where the drawing has them may agree by chance.
 _MIN_PATCHES = 20
 _NO_MATCHES: Matches = np.empty((0, 2), dtype=np.intp)
@@ -71,12 +76,15 @@ def estimate_jointly(
     rig = adjust_rig(cameras, keypoint_matches, start, ring, settings, converged=ROUGHLY_CONVERGED)
     far = {pair for pair, px in _prediction_px(rig, regions).items() if px > _FAR_AND_WIDE_PX}
     noise = AT_REST
+    believed = dict(regions)
     for k in range(_MAX_ROUNDS):
         before, prediction_px = rig.poses, _prediction_px(rig, regions)
         depth_only = far if k < _DEPTH_ROUNDS else set()
         refined = refine(
-            cameras, regions, before, rig.corrections, prediction_px, depth_only, keypoint_matches
+            cameras, believed, before, rig.corrections, prediction_px, depth_only, keypoint_matches
         )
+        for pair in _misplaced(refined, far - depth_only):
+            del believed[pair], refined.matches[pair]
         matches = _verified(refined, far - depth_only, prediction_px, settings)
         graduated = bool(far) and k < len(_GRADUATED_NOISE)
         assumed = _GRADUATED_NOISE[k] if graduated else noise
@@ -85,8 +93,11 @@ def estimate_jointly(
             noise = rig.observed_noise()
             if _largest_shift_px(before, rig.poses, regions) < _SETTLED_PX:
                 break
-    if noise.differs_from(rig.noise):
-        rig = adjust_rig(refined.cameras, matches, rig.poses, ring, settings, noise, rig.states)
+    shared = NOTHING_SHARED
+    if _any_weak(rig, regions, settings):
+        shared = find_shared_planes(cameras, rig.scene.cameras, rig.adjustment)
+    if noise.differs_from(rig.noise) or len(shared.planes):
+        rig = adjust_rig(refined.cameras, matches, rig.poses, ring, settings, noise, rig.states, shared)
     judged = in_threads(lambda edge: _refined_edge(edge, refined, matches, rig, settings), edges)
     return JointEstimate(rig, refined.cameras, tuple(judged))
 
@@ -120,6 +131,13 @@ def _verified(
     return out
 
 
+def _misplaced(refined: RefinedRig, far: Set[Pair]) -> set[Pair]:
+    """Pairs that only the drawing predicted and whose textures do not look alike where their depth does."""
+    return {
+        pair for pair in far & refined.found_share.keys() if refined.found_share[pair] < _LEAST_FOUND_SHARE
+    }
+
+
 def _largest_shift_px(before: Mapping[int, Pose], after: Mapping[int, Pose], pairs: Iterable[Pair]) -> float:
     """By how many pixels predictions changed, at most."""
     shifts = [0.0]
@@ -146,6 +164,13 @@ def _refined_edge(
         return replace(edge, matches=_NO_MATCHES, inlier=np.zeros(0, dtype=bool), reason=reason)
     T_i_j = inverse(rig.poses[i]) @ rig.poses[j]
     return estimate_edge(refined.cameras[i], refined.cameras[j], rows, T_i_j, settings, rig.states)
+
+
+def _any_weak(rig: AdjustedRig, pairs: Iterable[Pair], settings: CalibrationSettings) -> bool:
+    """Whether the gate would refuse a pair: only there do shared planes know more than patches do."""
+    sigmas = [weakest_direction(rig.relative(i, j)[1]) for i, j in pairs if i in rig.poses and j in rig.poses]
+    limits = settings.max_pair_sigma_deg, settings.max_pair_sigma_m
+    return any(deg > limits[0] or metres > limits[1] for deg, metres in sigmas)
 
 
 def _prediction_px(rig: AdjustedRig, pairs: Iterable[Pair]) -> dict[Pair, float]:

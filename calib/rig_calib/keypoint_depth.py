@@ -78,9 +78,16 @@ def keypoint_depth(
     planes, sigma = np.full((len(pixels), 3), np.nan), np.full(len(pixels), np.nan)
     for half in _HALF_WINDOWS_PX:
         fitted_planes(disparity, at, half, _MIN_FILLED, _MAX_RMS, _MAX_WORST, planes)
-        sigma[np.isnan(sigma) & np.isfinite(planes[:, 0])] = _sigma(half, frames)
+        sigma[np.isnan(sigma) & np.isfinite(planes[:, 0])] = window_sigma(half, frames)
     at[np.isnan(planes[:, 0])] = np.nan
     return KeypointDepth(planes[:, 0], planes[:, 1:], at, sigma)
+
+
+def on_one_plane(disparity: Array, grid_pixels: Array, half_px: int, filled: float) -> npt.NDArray[np.bool_]:
+    """(N,) whether one plane explains the window around each place, nothing missing but a share."""
+    planes = np.full((len(grid_pixels), 3), np.nan)
+    fitted_planes(disparity, grid_pixels, half_px, filled, _MAX_RMS, _MAX_WORST, planes)
+    return np.asarray(np.isfinite(planes[:, 0]))
 
 
 def keypoint_points(color: Intrinsics, grid: DepthGrid, pixels: Array, depth: KeypointDepth) -> Array:
@@ -119,7 +126,7 @@ def _ray_length(grid: DepthGrid, rays: Array, depth_m: Array) -> Array:
     return np.asarray((depth_m - offset) / (rays @ axis))
 
 
-def _sigma(half: int, frames: int) -> float:
+def window_sigma(half: int, frames: int) -> float:
     """Standard deviation of a plane's value at the middle of its window, averaged over frames."""
     independent = max(1.0, ((2 * half + 1) / (2.0 * _CORRELATION_PX)) ** 2)
     share = _FROZEN_SHARE + (1.0 - _FROZEN_SHARE) / frames

@@ -124,6 +124,10 @@ class PlaneObservations:
         """The observations that a mask or an index names."""
         return PlaneObservations(*(getattr(self, name)[keep] for name in self.__dataclass_fields__))
 
+    def renumbered(self, number: Index) -> "PlaneObservations":
+        """The observations of planes that have other numbers (K,) now."""
+        return replace(self, plane=number[self.plane])
+
     @classmethod
     def none(cls) -> "PlaneObservations":
         """No observations."""

@@ -17,9 +17,13 @@ _LIBRARIES = ("kinect-rig", "numpy", "scipy", "opencv-python-headless")
 def with_provenance(
     calibration: RigCalibration, source: str, agents: int, settings: dict[str, Any], **more: Any
 ) -> RigCalibration:
-    """The same calibration, stamped with the time, its source and agents, the versions and the settings."""
-    origin = {"source": source, "agents": agents, "versions": _versions(), "settings": settings, **more}
-    return dataclasses.replace(calibration, created=_now(), provenance=origin)
+    """The same calibration, stamped with the time, its source and agents, the versions and the settings.
+
+    What its provenance told before, it still tells.
+    """
+    origin = {"source": source, "agents": agents, "versions": _versions()}
+    provenance = {**origin, **calibration.provenance, "settings": settings, **more}
+    return dataclasses.replace(calibration, created=_now(), provenance=provenance)
 
 
 def with_recalibration(

@@ -6,6 +6,7 @@ where a wall is blank, depth is compared alone (a point-to-plane term). What is 
 keypoints in the same adjustment.
 """
 
+from collections import Counter
 from collections.abc import Mapping, Sequence, Set
 from dataclasses import dataclass
 from types import MappingProxyType
@@ -17,6 +18,7 @@ import scipy.spatial
 
 from rig_calib.depth_model import DepthCorrection
 from rig_calib.features import Keypoints
+from rig_calib.keypoint_depth import on_one_plane
 from rig_calib.matching import Matches
 from rig_calib.observed_camera import ObservedCamera
 from rig_calib.overlap import Region
@@ -38,6 +40,8 @@ _MAX_SIGMA_PX = 0.15  # along an edge a patch slides to where it was started: th
 _FLOOR_SIGMA_PX = 0.02
 _SOURCE_SIGMA_PX = 0.01  # a patch defines its point: all of the error is in the other image
 _BLANK_STEP = 2  # of the cells without texture, every second one compares depth
+# A patch over the edge of a thing moves with that, while its depth may be the wall's behind it.
+_MIN_FILLED = 0.9
 _REACH_PX = 3.0  # farther than this, and than three standard deviations of the prediction, is another place
 _PYRAMID_FROM_PX = 1.0  # predictions worse than this are looked for in smaller images first
 _MAX_LEVELS = 2
@@ -46,10 +50,14 @@ _NO_MATCHES: Matches = np.empty((0, 2), dtype=np.intp)
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RefinedRig:
-    """The cameras with patches as their keypoints, and the pairs (N,2) of them by pair of cameras."""
+    """The cameras with patches as their keypoints, and the pairs (N,2) of them by pair of cameras.
+
+    `found_share` of the patches with texture were found where they were looked for, by pair.
+    """
 
     cameras: Mapping[int, ObservedCamera]
-    matches: Mapping[Pair, Matches]
+    matches: dict[Pair, Matches]
+    found_share: Mapping[Pair, float]
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -61,6 +69,8 @@ class _Half:
     source_pixels: Array
     target_pixels: Array
     information: Array  # on target_pixels
+    textured: int = 0  # patches that were looked for ...
+    found: int = 0  # ... and those of them that look alike at the place
     source_information: Array | None = None  # None: a patch, which defines its point
 
 
@@ -127,7 +137,8 @@ def _align_half(
 ) -> _Half:
     ids = source.view.camera_id, target.view.camera_id
     depth = source.depth_at(pixels.astype(np.float64))
-    pixels, depth = pixels[depth.known], depth.select(depth.known)
+    flat = on_one_plane(source.disparity, depth.grid_pixels, RADIUS_PX, _MIN_FILLED)
+    pixels, depth = pixels[flat], depth.select(flat)
     colors = source.view.model.color, target.view.model.color
     planes = surface_planes(source.grid, depth, correction)
     start = transfer(*colors, T_target_source, planes, pixels.astype(np.float64))
@@ -141,22 +152,28 @@ def _align_half(
     )
     information = _with_floor(information)
     moved = np.linalg.norm(found - start, axis=1)
-    good = (
-        (correlation > _MIN_CORRELATION)
-        & (moved < max(_REACH_PX, 3.0 * prediction_px))
-        & (np.trace(information, axis1=1, axis2=2) > 0.0)
-    )
-    blank = ~good & (correlation < 0) & (np.arange(len(pixels)) % _BLANK_STEP == 0)
+    alike = (correlation > _MIN_CORRELATION) & (moved < max(_REACH_PX, 3.0 * prediction_px))
+    good = alike & (np.trace(information, axis1=1, axis2=2) > 0.0)
+    textured = correlation >= 0
+    blank = ~good & ~textured & (np.arange(len(pixels)) % _BLANK_STEP == 0)
     information[~good], found[~good] = 0.0, start[~good]
     keep = good | blank
-    return _Half(*ids, pixels[keep].astype(np.float64), found[keep], information[keep])
+    sizes = int(textured.sum()), int(alike.sum())
+    return _Half(*ids, pixels[keep].astype(np.float64), found[keep], information[keep], *sizes)
 
 
 def _keypoint_half(cameras: Mapping[int, ObservedCamera], pair: Pair, matches: Matches) -> _Half:
     i, j = pair
     a, b = cameras[i].keypoints, cameras[j].keypoints
     rows, columns = matches[:, 0], matches[:, 1]
-    return _Half(i, j, a.pixels[rows], b.pixels[columns], b.information[columns], a.information[rows])
+    return _Half(
+        i,
+        j,
+        a.pixels[rows],
+        b.pixels[columns],
+        b.information[columns],
+        source_information=a.information[rows],
+    )
 
 
 def _align_from_coarse(
@@ -215,6 +232,8 @@ def _collect(cameras: Mapping[int, ObservedCamera], halves: Sequence[_Half]) -> 
     information: dict[int, list[Array]] = {c: [] for c in cameras}
     count = dict.fromkeys(cameras, 0)
     matches: dict[Pair, list[Matches]] = {}
+    looked_for: Counter[Pair] = Counter()
+    found: Counter[Pair] = Counter()
 
     def add(camera: int, places: Array, known: Array) -> Index:
         pixels[camera].append(places)
@@ -231,11 +250,14 @@ def _collect(cameras: Mapping[int, ObservedCamera], halves: Sequence[_Half]) -> 
             half.target: add(half.target, half.target_pixels, half.information),
         }
         pair = min(ends), max(ends)
+        looked_for[pair] += half.textured
+        found[pair] += half.found
         matches.setdefault(pair, []).append(np.column_stack([ends[pair[0]], ends[pair[1]]]))
     refined = in_threads(lambda c: cameras[c].with_keypoints(_keypoints(pixels[c], information[c])), cameras)
     return RefinedRig(
         dict(zip(cameras, refined, strict=True)),
         {pair: np.concatenate(rows) for pair, rows in matches.items()},
+        {pair: found[pair] / count for pair, count in looked_for.items() if count},
     )
 
 

@@ -15,6 +15,7 @@ from rig_calib.observation_model import GRID_INTRINSIC_TERMS, GRID_POSE_TERMS, C
 from rig_calib.observed_camera import ObservedCamera
 from rig_calib.projection import from_pixels
 from rig_calib.settings import CalibrationSettings
+from rig_calib.shared_planes import NOTHING_SHARED, SharedPlanes
 from rig_calib.tracks import Scene, build_scene, build_tracks
 from rig_calib.uncertainty import PoseCovariance, pose_covariance
 from rig_calib.view import CameraView
@@ -117,6 +118,7 @@ def adjust_rig(
     settings: CalibrationSettings,
     noise: NoiseModel = AT_REST,
     states: Mapping[int, CameraState] = MappingProxyType({}),
+    shared: SharedPlanes = NOTHING_SHARED,
     converged: float = CONVERGED,
 ) -> AdjustedRig:
     """Adjust the cameras that have a start in `poses` from matches that are believed.
@@ -138,7 +140,9 @@ def adjust_rig(
         )
         for c in scene.cameras
     ]
-    result = adjust(adjusted, scene.points, scene.observations, converged=converged)
+    result = adjust(
+        adjusted, scene.points, scene.observations, shared.planes, shared.seen, converged=converged
+    )
     states = dict(zip(scene.cameras, result.states, strict=True))
     return AdjustedRig(
         poses={c: state.T_rig_camera for c, state in states.items()},
@@ -188,6 +192,7 @@ def _adjusted_camera(
         pose_sigma=pose_sigma,
         fixed_pose=fixed,
         gravity=camera.view.gravity,
+        gravity_sigma=float(np.deg2rad(camera.view.gravity_sigma_deg)),
     )
 
 

@@ -29,8 +29,13 @@ def surface_planes(grid: DepthGrid, depth: KeypointDepth, correction: DepthCorre
     in_grid = np.column_stack([by_x, by_y, inverse_z - by_x * at[:, 0] - by_y * at[:, 1]])
     if correction is not None:
         in_grid /= correction.factor(at[:, 0], at[:, 1])[:, None]
-    turned = in_grid @ grid.T_color_grid[:3, :3].T
-    return np.asarray(turned / (1.0 + turned @ grid.T_color_grid[:3, 3])[:, None])
+    return transform_planes(grid.T_color_grid, in_grid)
+
+
+def transform_planes(T_a_b: Pose, planes: Array) -> Array:
+    """Planes π (N,3) of frame b in frame a: Rπ / (1 + Rπ · t)."""
+    turned = planes @ T_a_b[:3, :3].T
+    return np.asarray(turned / (1.0 + turned @ T_a_b[:3, 3])[:, None])
 
 
 def transfer(

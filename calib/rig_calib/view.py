@@ -9,6 +9,7 @@ import numpy.typing as npt
 
 from rig_protocol.camera import CameraModel
 from rig_protocol.frames import DepthFrame, ImageU8, ImageU16, PanoramicFrame, RgbdFrame
+from rig_protocol.gravity import KINECT_SIGMA_DEG, common_gravity
 from rig_protocol.poses import Pose
 from rig_protocol.rig_folder import RigDescription
 
@@ -19,7 +20,8 @@ class CameraView:
 
     `color`: K images (H,W,3) BGR or (H,W) grey, u8. Depth, when there is any: K images of raw disparity
     (`raw`, 2047 = none) or of millimetres (`depth_mm`, 0 = none) on the grid of `depth_frame`. `gravity`
-    (3,): unit vector down in the colour camera frame, where an accelerometer measured it.
+    (3,): unit vector down in the colour camera frame, where an accelerometer measured it; `gravity_sigma_deg`
+    its standard deviation on each axis.
     """
 
     camera_id: int
@@ -31,6 +33,7 @@ class CameraView:
     depth_frame: DepthFrame = "depth"
     T_rig_nominal: Pose | None = None
     gravity: npt.NDArray[np.float64] | None = None
+    gravity_sigma_deg: float = KINECT_SIGMA_DEG
 
 
 def views_from_panoramas(
@@ -49,6 +52,7 @@ def views_from_panoramas(
 def _view(description: RigDescription, camera_id: int, frames: Sequence[RgbdFrame | None]) -> CameraView:
     entry = description.camera(camera_id)
     good = [frame for frame in frames if frame is not None and not frame.damaged]
+    gravity = common_gravity([frame.gravity for frame in good if frame.gravity is not None])
     return CameraView(
         camera_id=camera_id,
         name=entry.name,
@@ -58,6 +62,8 @@ def _view(description: RigDescription, camera_id: int, frames: Sequence[RgbdFram
         depth_mm=tuple(frame.depth_mm for frame in good if frame.depth_mm is not None),
         depth_frame=good[0].depth_frame if good else "depth",
         T_rig_nominal=entry.T_rig_camera,
+        gravity=None if gravity is None else np.array(gravity.down),
+        gravity_sigma_deg=KINECT_SIGMA_DEG if gravity is None else gravity.sigma_deg,
     )
 
 

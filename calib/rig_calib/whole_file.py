@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import BinaryIO
 
 from rig_protocol.errors import RigError
+from rig_protocol.troubleshooting import Topic
 
 
 @contextmanager
@@ -20,6 +21,6 @@ def whole_file(path: Path) -> Iterator[BinaryIO]:
             yield file
         part.replace(path)
     except OSError as error:
-        raise RigError(f"{path} could not be written: {error.strerror}") from error
+        raise RigError(f"{path} could not be written: {error.strerror}", Topic.FULL_DISK) from error
     finally:
         part.unlink(missing_ok=True)

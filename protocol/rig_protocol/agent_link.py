@@ -27,6 +27,7 @@ from rig_protocol.datagram import (
 from rig_protocol.errors import DataError, LinkUsageError
 from rig_protocol.events import AgentEvent, Connected, Disconnected, Rejected
 from rig_protocol.frames import EncodedFrame
+from rig_protocol.gravity import Gravity
 from rig_protocol.handshake import AgentHandshake, NotAuthentic
 from rig_protocol.message_bytes import MAX_CONTROL_SIZE, decode_body, encode_body
 from rig_protocol.messages import (
@@ -78,6 +79,8 @@ class AgentLink:
         self.counters = AgentCounters()
         self.plan: StreamPlan | None = None
         """What the server wants now, until the next session; None: send as the welcome says."""
+        self.gravity: Gravity | None = None
+        """Down as the camera feels it now, set by the shell; the next heartbeats tell it."""
         self._hello = hello
         self._rig_key, self._random_bytes = rig_key, random_bytes
         self._datagram_size = datagram_size
@@ -121,7 +124,7 @@ class AgentLink:
             return last_words
         datagrams = self._hello_if_due(now_ns)
         if self._session is not None:
-            datagrams += self._session.datagrams_to_send(now_ns, self._health, system_clock)
+            datagrams += self._session.datagrams_to_send(now_ns, self._health, self.gravity, system_clock)
         return datagrams
 
     @property

@@ -7,6 +7,7 @@ from rig_protocol.datagram import Buffer, DatagramBatch
 from rig_protocol.fragmenter import fragment
 from rig_protocol.frame_history import FrameHistory
 from rig_protocol.frames import EncodedFrame
+from rig_protocol.gravity import Gravity
 from rig_protocol.handshake import Agreement
 from rig_protocol.message_bytes import encode_body
 from rig_protocol.messages import ClockReply, ClockRequest, Goodbye, Heartbeat, Message, Resend
@@ -38,6 +39,7 @@ class AgentSession:
         )
         self._seal = FrameSeal(self.welcome.cipher, keys)
         self._heartbeat_due_ns = now_ns
+        self._tells_gravity = False  # the latest heartbeat did
         self._frame_number = 0
         self._sent_frames = 0  # all below this number have left, as of the latest `answer_resends`
         self._clock_requests: deque[tuple[ClockRequest, int]] = deque(maxlen=_MAX_CLOCK_REQUESTS)
@@ -77,18 +79,27 @@ class AgentSession:
         self._resends.append(resend)
 
     def datagrams_to_send(
-        self, now_ns: int, health: Mapping[str, float], system_clock: SystemClockReading | None
+        self,
+        now_ns: int,
+        health: Mapping[str, float],
+        gravity: Gravity | None,
+        system_clock: SystemClockReading | None,
     ) -> list[bytes]:
-        """Clock replies, stamped with `now_ns`, and the heartbeat where it is due."""
+        """Clock replies, stamped with `now_ns`, and the heartbeat where it is due.
+
+        It is due at once when the camera begins to feel gravity, or ceases to because it is moved.
+        """
         datagrams = [
             self.seal(_reply(request, received_ns, now_ns, system_clock))
             for request, received_ns in self._clock_requests
         ]
         self._clock_requests.clear()
-        if is_due(self._heartbeat_due_ns, now_ns, HEARTBEAT_INTERVAL_NS):
+        changed = (gravity is not None) != self._tells_gravity
+        if changed or is_due(self._heartbeat_due_ns, now_ns, HEARTBEAT_INTERVAL_NS):
+            self._tells_gravity = gravity is not None
             interval_ns = HEARTBEAT_INTERVAL_NS if self.confirmed else CONFIRM_INTERVAL_NS
             self._heartbeat_due_ns = now_ns + interval_ns
-            datagrams.append(self.seal(Heartbeat(health, self._sent_frames)))
+            datagrams.append(self.seal(Heartbeat(health, self._sent_frames, gravity)))
         return datagrams
 
     def cut(self, frame: EncodedFrame, datagram_size: int) -> DatagramBatch:

@@ -11,6 +11,8 @@ from typing import Literal, Self
 import numpy as np
 import numpy.typing as npt
 
+from rig_protocol.gravity import Gravity
+
 ImageU8 = npt.NDArray[np.uint8]
 ImageU16 = npt.NDArray[np.uint16]
 
@@ -32,6 +34,7 @@ class RgbdFrame:
     asked to demosaic gives both.
     Depth is either `raw` (H,W) u16 11-bit disparity, 2047 = none, or `depth_mm` (H,W) u16, 0 = none.
     `received_ns`: rig time at which its last datagram was here; None where it crossed no network.
+    `gravity`: down as the camera felt it then or seconds before; None where it has no accelerometer.
     """
 
     camera_id: int
@@ -45,6 +48,7 @@ class RgbdFrame:
     depth_frame: DepthFrame = "depth"
     damaged: bool = False
     received_ns: int | None = None
+    gravity: Gravity | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -60,7 +64,8 @@ class EncodedFrame:
     """An RgbdFrame as it crosses the wire; either payload may be absent.
 
     `timestamp_ns` is agent time on the agent and rig time once the server's link has delivered the frame;
-    from then on `received_ns` is the rig time at which its last datagram was here.
+    from then on `received_ns` is the rig time at which its last datagram was here, and `gravity` what the
+    latest heartbeat told.
     """
 
     camera_id: int
@@ -72,6 +77,7 @@ class EncodedFrame:
     depth_frame: DepthFrame = "depth"
     damaged: bool = False
     received_ns: int | None = None
+    gravity: Gravity | None = None
 
 
 @dataclass(frozen=True, slots=True)

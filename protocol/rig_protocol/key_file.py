@@ -8,6 +8,7 @@ from pathlib import Path
 
 from rig_protocol.errors import ConfigurationError, DataError
 from rig_protocol.rig_key import RigKey
+from rig_protocol.troubleshooting import Topic
 
 _log = logging.getLogger(__name__)
 
@@ -32,7 +33,8 @@ def rig_key(file: Path | None, insecure: bool) -> RigKey:
     if found is None:
         raise ConfigurationError(
             "this rig has no key: run `rig-server keygen` on the PC and copy rig.key to "
-            f"{KEY_PLACES[-1]} on every machine (or run all of them with --insecure on an isolated bench)"
+            f"{KEY_PLACES[-1]} on every machine (or run all of them with --insecure on an isolated bench)",
+            Topic.RIG_KEY,
         )
     return read_key(found)
 
@@ -52,16 +54,19 @@ def read_key(path: Path) -> RigKey:
             mode = stat.S_IMODE(os.fstat(file.fileno()).st_mode)
             content = file.read(_MAX_BYTES)
     except OSError as error:
-        raise ConfigurationError(f"key file {path} cannot be read: {error.strerror}") from error
+        raise ConfigurationError(
+            f"key file {path} cannot be read: {error.strerror}", Topic.RIG_KEY
+        ) from error
     if mode & ~_OWNER_ONLY:
         raise ConfigurationError(
             f"key file {path} has mode {mode:04o}, others may read or change it: chmod 600 {path}; "
-            "if anybody did, make a new key with `rig-server keygen --force`"
+            "if anybody did, make a new key with `rig-server keygen --force`",
+            Topic.RIG_KEY,
         )
     try:
         return RigKey.parse(content.decode("ascii"))
     except (DataError, UnicodeDecodeError) as error:
-        raise ConfigurationError(f"key file {path}: {error}") from error
+        raise ConfigurationError(f"key file {path}: {error}", Topic.RIG_KEY) from error
 
 
 def write_key(path: Path, key: RigKey, force: bool = False) -> None:

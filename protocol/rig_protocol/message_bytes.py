@@ -15,6 +15,7 @@ from rig_protocol.datagram import (
     MessageType,
 )
 from rig_protocol.errors import DataError, LinkUsageError
+from rig_protocol.gravity import Gravity
 from rig_protocol.message_fields import (
     Fields,
     cipher,
@@ -230,13 +231,16 @@ def _write_heartbeat(heartbeat: Heartbeat) -> bytes:
         health = gauges({"health": dict(heartbeat.health)}, "health", MAX_GAUGES, MAX_GAUGE_NAME_BYTES)
     except DataError as error:
         raise LinkUsageError(f"this heartbeat cannot be sent: {error}") from error
-    return bytes(msgpack.packb({"health": health, "frames": heartbeat.frames}))
+    gravity = {} if heartbeat.gravity is None else {"gravity": heartbeat.gravity.to_dict()}
+    return bytes(msgpack.packb({"health": health, "frames": heartbeat.frames, **gravity}))
 
 
 def _read_heartbeat(body: bytes) -> Heartbeat:
     values = unpack_map(body)
     health = gauges(values, "health", MAX_GAUGES, MAX_GAUGE_NAME_BYTES)
-    return Heartbeat(health, integer(values, "frames", 0, 2**64 - 1))
+    felt = values.get("gravity")
+    gravity = None if felt is None else Gravity.from_dict(felt)
+    return Heartbeat(health, integer(values, "frames", 0, 2**64 - 1), gravity)
 
 
 def _read_clock_request(body: bytes) -> ClockRequest:

@@ -7,6 +7,7 @@ from enum import Enum
 from rig_protocol.camera import CameraModel
 from rig_protocol.datagram import VERSION
 from rig_protocol.frames import EncodedFrame
+from rig_protocol.gravity import Gravity
 from rig_protocol.security import Cipher
 
 
@@ -128,10 +129,12 @@ class Heartbeat:
     """The agent is alive; `health` are its own gauges by name, for the operator.
 
     `frames`: how many frames of this session have been sent, so that the last ones are missed, too.
+    `gravity`: down as the camera feels it now, None where it has no accelerometer or is being moved.
     """
 
     health: Mapping[str, float]
     frames: int = 0
+    gravity: Gravity | None = None
 
 
 @dataclass(frozen=True, slots=True)

@@ -12,6 +12,7 @@ from rich.console import Console
 from rich.logging import RichHandler
 
 from rig_protocol.errors import RigError
+from rig_protocol.troubleshooting import reference
 
 EXIT_DONE, EXIT_FAILED, EXIT_USAGE = 0, 1, 2
 SignalHandler = Callable[[int, FrameType | None], None]
@@ -36,6 +37,7 @@ def run_program(app: typer.Typer, on_sigterm: SignalHandler = leave_as_by_ctrl_c
     except RigError as error:
         console.print("error:", style="bold red", end=" ")
         console.print(str(error), markup=False, soft_wrap=True)
+        console.print(reference(error.topic), style="dim", soft_wrap=True)
         sys.exit(error.exit_status)
     except BrokenPipeError:
         # The reader of our output went away (`rig-server | head`); keep the interpreter from complaining.
@@ -52,8 +54,17 @@ def set_up_logging(level: str = "INFO", console: Console | None = None) -> None:
     if sys.stderr.isatty():
         shared = console if console is not None and console.is_terminal else Console(stderr=True)
         handler = RichHandler(console=shared, show_path=False, rich_tracebacks=True)
-        handler.setFormatter(logging.Formatter("%(message)s"))
+        handler.setFormatter(_ReferringFormatter("%(message)s"))
     else:
         handler = logging.StreamHandler()
-        handler.setFormatter(logging.Formatter("%(levelname)s %(name)s: %(message)s"))
+        handler.setFormatter(_ReferringFormatter("%(levelname)s %(name)s: %(message)s"))
     logging.basicConfig(level=level.upper(), handlers=[handler], force=True)
+
+
+class _ReferringFormatter(logging.Formatter):
+    """Ends a line that has a topic with where to read on."""
+
+    def formatMessage(self, record: logging.LogRecord) -> str:
+        told = super().formatMessage(record)
+        topic = getattr(record, "topic", None)
+        return told if topic is None else f"{told} ({reference(topic)})"

@@ -6,7 +6,7 @@ Images stay as the sensor delivered them. Readers ignore keys that they do not k
 import json
 import re
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +17,7 @@ import numpy.typing as npt
 from rig_protocol.camera import CameraModel, RawDepthModel, as_pose
 from rig_protocol.errors import ConfigurationError, DataError
 from rig_protocol.frames import RgbdFrame
+from rig_protocol.gravity import Gravity, common_gravity
 from rig_protocol.poses import Pose
 
 _FRAME_PERIOD_NS = 33_333_333  # a folder holds no times: frame k is stamped as a 30-Hz sensor would
@@ -72,12 +73,16 @@ class RingDrawing:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class CameraEntry:
-    """One camera of a rig: identity, model, and its pose where one is known."""
+    """One camera of a rig: identity, model, and its pose where one is known.
+
+    `gravity`: down as it felt it during a capture; None where no accelerometer did.
+    """
 
     id: int
     name: str
     model: CameraModel
     T_rig_camera: Pose | None = None
+    gravity: Gravity | None = None
 
 
 @dataclass(frozen=True, slots=True)
@@ -112,6 +117,7 @@ class RigDescription:
                 "name": camera.name,
                 "T_rig_cam": None if camera.T_rig_camera is None else camera.T_rig_camera.tolist(),
                 **camera.model.to_dict(),
+                **({} if camera.gravity is None else {"gravity": camera.gravity.to_dict()}),
             }
             for camera in self.cameras
         ]
@@ -196,23 +202,32 @@ def read_frame(folder: Path, camera: CameraEntry, index: int) -> RgbdFrame:
         raw=raw,
         depth_mm=depth_mm,
         depth_frame="color" if depth_frame == "color" else "depth",
+        gravity=camera.gravity,
     )
 
 
 def write_rig_folder(folder: Path, description: RigDescription, frames: Iterable[RgbdFrame]) -> None:
-    """Write `nominal.json` and every frame, its sequence as the panoramic index.
+    """Write every frame, its sequence as the panoramic index, then `nominal.json` with what they felt.
 
     A Bayer image is demosaiced: the format holds colour as people look at it.
     """
     folder.mkdir(parents=True, exist_ok=True)
-    (folder / "nominal.json").write_text(json.dumps(description.to_dict(), indent=1) + "\n")
+    felt: dict[int, list[Gravity]] = {}
     for frame in frames:
+        if frame.gravity is not None:
+            felt.setdefault(frame.camera_id, []).append(frame.gravity)
         directory = folder / description.camera(frame.camera_id).name
         directory.mkdir(exist_ok=True)
         for kind, image in _images(frame).items():
             target = directory / f"{kind}_{frame.sequence:03d}.png"
             if not cv2.imwrite(str(target), image):
                 raise DataError(f"{target} could not be written")
+    cameras = tuple(
+        replace(entry, gravity=common_gravity(felt[entry.id])) if entry.id in felt else entry
+        for entry in description.cameras
+    )
+    told = replace(description, cameras=cameras).to_dict()
+    (folder / "nominal.json").write_text(json.dumps(told, indent=1) + "\n")
 
 
 def read_json(path: Path) -> Any:
@@ -237,9 +252,11 @@ def _camera_entry(item: Any, raw_model: RawDepthModel | None) -> CameraEntry:
     try:
         model = CameraModel.from_dict(item, raw_model)
         pose = None if T is None else as_pose(T, "T_rig_cam")
+        felt = item.get("gravity")
+        gravity = None if felt is None else Gravity.from_dict(felt)
     except DataError as error:
         raise DataError(f"camera {camera_id}: {error}") from error
-    return CameraEntry(camera_id, name, model, pose)
+    return CameraEntry(camera_id, name, model, pose, gravity)
 
 
 def _images(frame: RgbdFrame) -> dict[str, npt.NDArray[Any]]:

@@ -10,6 +10,7 @@ from rig_protocol.datagram import Buffer, FragmentHeader
 from rig_protocol.errors import LinkUsageError
 from rig_protocol.events import Address
 from rig_protocol.frames import EncodedFrame
+from rig_protocol.gravity import Gravity
 from rig_protocol.handshake import Agreement
 from rig_protocol.message_bytes import encode_body
 from rig_protocol.messages import ClockReply, Heartbeat, Hello, Message, StreamChoice, StreamPlan
@@ -23,6 +24,8 @@ SILENCE_NS = 2_000_000_000
 # A frame is in the past when it arrives; clocks and their reading err by so much beyond the uncertainty.
 _FUTURE_MARGIN_NS = 1_000_000
 _FUTURE_UNCERTAINTIES = 4
+# What a heartbeat tells of gravity holds for frames that come so soon after it: four heartbeats.
+GRAVITY_AGE_NS = 2_000_000_000
 # No queue of an agent holds frames for so long: an older stamp is a wrong one.
 MAX_FRAME_AGE_NS = 10_000_000_000
 # Frames of a new session that overtake its first clock reply: 130 ms at 30 frames/s.
@@ -68,6 +71,8 @@ class ServerSession:
             welcome.cipher, keys.server_control, keys.agent_control, welcome.session_id
         )
         self._clock = ClockSync(now_ns)
+        self._gravity: Gravity | None = None
+        self._gravity_ns = now_ns
         self._early: list[tuple[EncodedFrame, int]] = []  # with their arrival; before the clock is known
         self._reassembler = Reassembler(
             welcome.camera_id,
@@ -132,8 +137,9 @@ class ServerSession:
         return [frame for frame in delivered if frame is not None]
 
     def receive_heartbeat(self, heartbeat: Heartbeat, now_ns: int) -> None:
-        """The agent's gauges, and how many frames it has sent."""
+        """The agent's gauges, which way it feels down, and how many frames it has sent."""
         self.status.health = heartbeat.health
+        self._gravity, self._gravity_ns = heartbeat.gravity, now_ns
         self._reassembler.heard_of(heartbeat.frames, now_ns)
         self.due_ns = min(self.due_ns, self._reassembler.due_ns)
 
@@ -190,7 +196,13 @@ class ServerSession:
         counters.damaged += frame.damaged
         timestamp_ns, uncertainty_ns = stamp
         total_ns = ceil(hypot(uncertainty_ns, frame.uncertainty_ns))
-        return replace(frame, timestamp_ns=timestamp_ns, uncertainty_ns=total_ns, received_ns=received_ns)
+        return replace(
+            frame,
+            timestamp_ns=timestamp_ns,
+            uncertainty_ns=total_ns,
+            received_ns=received_ns,
+            gravity=self._gravity if abs(received_ns - self._gravity_ns) <= GRAVITY_AGE_NS else None,
+        )
 
     def _stamp(self, agent_time_ns: int, now_ns: int) -> tuple[int, int] | None:
         """Rig time and its uncertainty; None where it is not known or cannot be true."""

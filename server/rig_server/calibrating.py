@@ -13,6 +13,7 @@ from rig_calib.terminal import calibration_tables, evaluation_table, progress_ba
 from rig_protocol.errors import RigError
 from rig_protocol.poses import Pose
 from rig_protocol.rig_folder import write_true_poses
+from rig_protocol.troubleshooting import Topic
 from rig_server.calibration_task import CalibrationTask, Estimate
 from rig_server.coach_display import CoachDisplay, counted
 from rig_server.coached_capture import coached_capture
@@ -67,7 +68,7 @@ def _judge(task: CalibrationTask, estimate: Estimate, console: Console) -> None:
     if estimate.missed is not None:
         troubles.append(f"the calibration misses its target: {estimate.missed}")
     if troubles:
-        raise RigError("; ".join(troubles))
+        raise RigError("; ".join(troubles), Topic.CALIBRATION_REFUSED)
     if task.target is not None:
         console.print(f"the target is met on {counted(estimate.sets, 'set')}")
 

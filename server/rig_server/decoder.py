@@ -35,6 +35,7 @@ def decode_frame(frame: EncodedFrame, demosaic: bool = False) -> RgbdFrame:
         depth_frame=frame.depth_frame,
         damaged=frame.damaged,
         received_ns=frame.received_ns,
+        gravity=frame.gravity,
         **images,
     )
 

@@ -23,6 +23,7 @@ from rig_protocol.rig_key import RigKey
 from rig_protocol.roster import Roster, Slot
 from rig_protocol.server_link import ServerLink
 from rig_protocol.system_clock import SystemClock
+from rig_protocol.troubleshooting import Topic, see
 from rig_server.assembler import Assembler
 from rig_server.attendance import absence_message, is_whole
 from rig_server.config import RigSettings
@@ -169,13 +170,14 @@ class LivePipeline:
                 self._assembler.camera_left(camera_id)
                 with self._presence:
                     self._connected.discard(camera_id)
-                logger.warning("camera %d left: %s", camera_id, text)
+                logger.warning("camera %d left: %s", camera_id, text, extra=see(Topic.MISSING_CAMERA))
             case HelloRefused(address, _, text):
                 with self._presence:
                     # An agent tries on every few seconds; the operator is told once.
                     told = any(one.address[0] == address[0] and one.text == text for one in self._refusals)
                     self._refusals.append(event)
-                logger.log(logging.DEBUG if told else logging.WARNING, "refused %s: %s", address[0], text)
+                level = logging.DEBUG if told else logging.WARNING
+                logger.log(level, "refused %s: %s", address[0], text, extra=see(Topic.AGENT_REFUSED))
 
     def _on_turn(self, now_ns: int) -> None:
         """On the receiver's thread, after every wake-up."""

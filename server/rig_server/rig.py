@@ -17,6 +17,7 @@ from rig_protocol.messages import Hello
 from rig_protocol.poses import Pose
 from rig_protocol.rig_folder import RigDescription
 from rig_protocol.rig_key import RigKey
+from rig_protocol.troubleshooting import Topic
 from rig_server.config import MAX_CAMERAS, RigSettings, load_rig_settings, parse_address
 from rig_server.metrics import RigStatus
 from rig_server.pipeline import LivePipeline
@@ -182,7 +183,7 @@ class Rig:
             if self._simulation is not None:
                 self._simulation.check()
             if time.monotonic() >= until_s:
-                raise RigError(f"after {timeout_s:.0f} s {absence}")
+                raise RigError(f"after {timeout_s:.0f} s {absence}", Topic.MISSING_CAMERA)
             if on_wait is not None:
                 on_wait(self.status())
             time.sleep(_POLL_S)

@@ -5,6 +5,7 @@ import logging
 from rig_protocol.events import CameraJoined, CameraLeft, FrameReceived, ServerEvent
 from rig_protocol.messages import StreamChoice
 from rig_protocol.server_link import ServerLink
+from rig_protocol.troubleshooting import Topic, see
 from rig_server.stream_planner import Refusal, StreamPlanner
 
 logger = logging.getLogger(__name__)
@@ -58,4 +59,5 @@ class StreamControl:
                 self._told[camera_id] = choice
                 self._link.plan_stream(camera_id, choice)
         for note in self._planner.take_notes():
-            logger.log(note.severity, "%s", note.text)
+            extra = see(Topic.LOW_RATE) if note.severity >= logging.WARNING else None
+            logger.log(note.severity, "%s", note.text, extra=extra)

@@ -7,6 +7,7 @@ import struct
 
 from rig_protocol.errors import ConfigurationError, RigError
 from rig_protocol.events import Address
+from rig_protocol.troubleshooting import Topic, see
 
 logger = logging.getLogger(__name__)
 
@@ -42,7 +43,7 @@ def bind_error(error: OSError, address: Address, in_use: str) -> RigError:
     """What to tell the operator when a socket cannot be bound; `in_use`: when the port is taken."""
     host, port = address
     if error.errno == errno.EADDRINUSE:
-        return RigError(in_use)
+        return RigError(in_use, Topic.PORT_IN_USE)
     if error.errno == errno.EADDRNOTAVAIL:
         return ConfigurationError(f"no interface of this machine has address {host}: see `ip addr`")
     return ConfigurationError(f"cannot listen on {host}:{port}: {error.strerror}")
@@ -61,6 +62,7 @@ def ask_for_receive_buffer(bound: socket.socket, wanted: int) -> int:
                 _granted(bound) // 1024,
                 wanted // 1024,
                 wanted,
+                extra=see(Topic.SMALL_RECEIVE_BUFFER),
             )
     return _granted(bound)
 

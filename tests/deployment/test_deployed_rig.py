@@ -5,6 +5,7 @@ The tests build on one another, in this order: installed by chroot, booted, upgr
 """
 
 import importlib.util
+import json
 import os
 import re
 import shutil
@@ -213,6 +214,23 @@ def test_booted_machines_stream_and_need_no_further_change(site: Site) -> None:
     third = site.play("site.yml", booted=True)
     assert third.status == 0, third.output
     assert third.changed == {"pc": 0, "pi": 0}, third.output
+
+
+@pytest.mark.parametrize("source", ["synthetic", "freenect"])
+def test_the_doctor_finds_nothing_wrong_but_the_hardware(site: Site, source: str) -> None:
+    words = ["runuser", "--user=kinect-rig", "--", "env", f"RIG_AGENT_SOURCE={source}"]
+    words += [
+        "/opt/kinect-rig/current/bin/rig-agent",
+        "--config",
+        "/etc/kinect-rig/cam00.toml",
+        "--check",
+        "--json",
+    ]
+    said = site.machines["pi"].run(*words, check=False)
+    report = json.loads(said)
+    lines = [f"{one['status']} {one['check']}: {one['text']}" for one in report["findings"]]
+    print("\n".join(lines))
+    assert report["passed_but_for_hardware"], said
 
 
 def test_the_journal_says_which_camera_speaks(site: Site) -> None:

@@ -113,6 +113,7 @@ def test_simulated_rig_is_calibrated_fused_and_compared_with_the_truth(tmp_path:
     assert len(calibration["cameras"]) == 12
     assert calibration["provenance"]["source"] == "udp"
     assert calibration["provenance"]["agents"] == 12
+    assert calibration["provenance"]["gravity_cameras"] == list(range(12))
     errors = evaluate(RigCalibration.load(tmp_path / "calibration.json"), read_true_poses(tmp_path))
     neighbours = errors.over(errors.neighbours)
     assert neighbours is not None

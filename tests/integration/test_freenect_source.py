@@ -12,6 +12,7 @@ import pytest
 from rig_agent.sources.freenect import FreenectSettings, FreenectSource
 from rig_protocol.errors import ConfigurationError
 from rig_protocol.frames import RgbdFrame
+from rig_protocol.gravity import Gravity
 from support.virtual_usb.virtual_bus import KinectFrames, VirtualBus, environment, kinect_frames
 
 FRAME_INTERVAL_NS = 1e9 / 30
@@ -124,6 +125,48 @@ def test_several_kinects_without_a_choice_are_a_configuration_error(usb_bus: Vir
     usb_bus.add_kinect("A00000000000000B")
     with pytest.raises(ConfigurationError, match=r"2 Kinects.*A0+A.*A0+B.*`serial` or `port_path`"):
         FreenectSource(FreenectSettings())
+
+
+def wait_for_gravity(source: FreenectSource) -> Gravity | None:
+    """What the frames tell once they tell it, or None after 90 of them."""
+    for _ in range(90):
+        frame = source.read(1.0)
+        assert frame is not None
+        if frame.gravity is not None:
+            return frame.gravity
+    return None
+
+
+def test_frames_tell_which_way_is_down_by_the_kinects_own_accelerometer(usb_bus: VirtualBus) -> None:
+    usb_bus.add_kinect("B50123456789012B", model="1473")  # before it on the bus, and without a motor
+    usb_bus.add_kinect("A00364A11111111A").write("accel", "819 0 0 0 0")
+    kinect = usb_bus.add_kinect("A00364A22222222A")
+    kinect.write("accel", "0 800 -180 0 0")
+    with FreenectSource(FreenectSettings(serial=kinect.serial)) as source:
+        gravity = wait_for_gravity(source)
+    assert gravity is not None
+    np.testing.assert_allclose(gravity.down, (0, 0.976, 0.220), atol=0.001)
+    assert kinect.open_handles() == 0
+
+
+@pytest.mark.parametrize("model", ["1473", "K4W"])
+def test_a_kinect_without_a_motor_of_its_own_streams_and_feels_nothing(
+    usb_bus: VirtualBus, model: str
+) -> None:
+    usb_bus.add_kinect("B50123456789012B", model=model.lower())
+    with FreenectSource(FreenectSettings()) as source:
+        assert all(frame.gravity is None for frame in frames_of(source, seconds=1.0))
+
+
+def test_a_motor_that_never_answers_costs_no_frame(usb_bus: VirtualBus) -> None:
+    usb_bus.add_kinect("A00364A11111111A").write("mute_motor")
+    with FreenectSource(FreenectSettings()) as source:
+        frames = frames_of(source, seconds=1.5)
+        counters = source.counters
+    assert all(frame.gravity is None for frame in frames)
+    assert counters["unpaired"] == counters["damaged"] == 0
+    # Whoever waited for the motor would lose a quarter of a second, seven frames, each time.
+    assert len(frames) + counters["overrun"] > 36
 
 
 def test_a_child_process_finds_the_virtual_bus_in_place_of_the_machines(usb_bus: VirtualBus) -> None:

@@ -7,6 +7,7 @@ from rig_protocol.clear_datagram import encode_clear
 from rig_protocol.datagram import DatagramBatch
 from rig_protocol.fragmenter import fragment
 from rig_protocol.frames import EncodedFrame, Payload
+from rig_protocol.gravity import Gravity
 from rig_protocol.handshake import AgentHandshake, answer_hello
 from rig_protocol.message_bytes import encode_body
 from rig_protocol.messages import (
@@ -57,6 +58,7 @@ FROM_AGENT: dict[str, Message] = {
     "clock reply": ClockReply(1_000_000_000, -5, 2**62),
     "clock reply of a disciplined clock": ClockReply(1, 2, 3, 1_700_000_000_000_000_000, 25_000),
     "goodbye": Goodbye("the agent stops"),
+    "heartbeat with gravity": Heartbeat({}, 5, Gravity((0.6, -0.8, 0.0), 1.5)),
 }
 FROM_SERVER: dict[str, Message] = {
     "clock request": ClockRequest(1_000_000_000),

@@ -62,7 +62,8 @@ def _panorama(rig: VirtualRig, path: Path, k: int) -> PanoramicFrame:
     if not path.exists():
         _store(path, {i: rig.camera(i).frame(k) for i in ids})
     with np.load(path) as stored:
-        frames = {i: RgbdFrame(i, k, 0, bayer=stored[f"bayer_{i}"], raw=stored.get(f"raw_{i}")) for i in ids}
+        images = {i: {"bayer": stored[f"bayer_{i}"], "raw": stored.get(f"raw_{i}")} for i in ids}
+    frames = {i: RgbdFrame(i, k, 0, gravity=rig.camera(i).gravity(k), **images[i]) for i in ids}
     return PanoramicFrame.of(k, frames)
 
 

@@ -6,6 +6,7 @@ from functools import cached_property
 import numpy as np
 import numpy.typing as npt
 
+from rig_agent.simulator.accelerometer import felt_acceleration
 from rig_agent.simulator.color_sensor import BayerSensor
 from rig_agent.simulator.foreground import PROJECTOR_BASELINE_M, LampLight, color_patches, depth_patches
 from rig_agent.simulator.kinect_noise import CleanDepth, DisparitySensor, Mask
@@ -18,6 +19,7 @@ from rig_agent.simulator.streams import Stream, generator
 from rig_agent.simulator.units import VirtualUnit, draw_T_rig_camera, draw_unit
 from rig_protocol.camera import CameraModel, Intrinsics
 from rig_protocol.frames import ImageU8, ImageU16, RgbdFrame
+from rig_protocol.gravity import Gravity
 from rig_protocol.poses import Pose, inverse, transform_points
 
 Images = tuple[ImageU8, ImageU16 | None]
@@ -161,17 +163,31 @@ class VirtualKinect:
         """What is seen, without the sensor's errors, when a frame is taken."""
         return View(self._scene, self.unit, self.T_rig_camera_at(frame))
 
+    def gravity(self, k: int) -> Gravity | None:
+        """Down as the unit feels it when frame k is taken; None without accelerometers."""
+        if not self._settings.accelerometers:
+            return None
+        R_room_color = (self._scene.T_room_rig @ self.T_rig_camera_at(k))[:3, :3]
+        felt_g = felt_acceleration(self._settings, self.id, self._moment(k), -R_room_color[2])
+        return Gravity.along(felt_g)
+
     def frame(self, k: int) -> RgbdFrame:
         """Frame k, stamped as if frame 0 was taken at `phase_ns`; all repeats after `frames_rendered`."""
-        loop = self._settings.frames_rendered
-        images = self._looped(k, k % loop) if loop else self._images(k, k)
+        moment = self._moment(k)
+        images = self._looped(k, moment) if self._settings.frames_rendered else self._images(k, moment)
         return RgbdFrame(
             camera_id=self.id,
             sequence=k,
             timestamp_ns=self.phase_ns + k * self.frame_interval_ns,
             bayer=images[0],
             raw=images[1],
+            gravity=self.gravity(k),
         )
+
+    def _moment(self, k: int) -> int:
+        """The frame whose people and noise frame k shows."""
+        loop = self._settings.frames_rendered
+        return k % loop if loop else k
 
     def _looped(self, k: int, moment: int) -> Images:
         key = (self._knocked(k), moment)

@@ -80,6 +80,11 @@ class SimulatorSettings(Settings):
     exposure_spread: float = Field(0.12, ge=0, le=1)
     """Spread of the cameras' exposures, natural logarithm."""
 
+    accelerometers: bool = True
+    """Whether the units feel which way is down, as model 1414 does."""
+    accelerometer_deg: float = Field(1.5, ge=0, le=15)
+    """By how much a unit errs about that, one sigma an axis, the same all the time."""
+
     depthless_camera: int | None = None
     """Id of a camera that delivers colour only."""
     knock: Knock | None = None

@@ -17,6 +17,7 @@ class Stream(IntEnum):
     PHASE = 7007
     KNOCK = 7008
     PEOPLE = 7009
+    ACCELEROMETER = 7010
 
 
 def generator(seed: int, stream: Stream, *key: int) -> np.random.Generator:

@@ -8,13 +8,21 @@ from typing import Literal, Protocol, Self
 from rig_protocol.camera import CameraModel
 from rig_protocol.errors import RigError
 from rig_protocol.frames import RgbdFrame
+from rig_protocol.troubleshooting import Topic
 
 ColorImage = Literal["bayer", "bgr", "grey"]
 DepthImage = Literal["raw", "depth_mm"]
+ControlValue = bool | float | str
 
 
 class SourceLost(RigError):  # noqa: N818  # it reads as what happened: the source is lost
     """The device died or cannot be opened now: close the source, wait, open it again."""
+
+    topic = Topic.NO_FRAMES
+
+
+class ControlRefused(RigError):  # noqa: N818  # as above
+    """The source does not have this control, or not this value; the text says which it has."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -51,8 +59,17 @@ class FrameSource(Protocol):
     def read(self, timeout_s: float) -> RgbdFrame | None:
         """The next frame, stamped in agent time (CLOCK_MONOTONIC, ns), or None after `timeout_s`.
 
-        The agent replaces `camera_id`. Raises SourceLost when the device died, DataError when what the
+        The agent replaces `camera_id`. `gravity` is what an accelerometer feels now; None where there is none
+        or the camera is being moved. Raises SourceLost when the device died, DataError when what the
         source reads is malformed.
+        """
+        ...
+
+    def control(self, name: str, value: ControlValue) -> str:
+        """Set one of the device's controls; what was done, in words for the operator.
+
+        Names are those of docs/control.md (`led`, `tilt_deg`, `depth`, ...). The thread that reads calls it.
+        ControlRefused where the source has no such control or value, SourceLost when the device died of it.
         """
         ...
 

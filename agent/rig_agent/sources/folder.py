@@ -11,7 +11,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import Self
 
-from rig_agent.sources.base import ColorImage, DepthImage, SourceDescription
+from rig_agent.sources.base import ColorImage, ControlRefused, ControlValue, DepthImage, SourceDescription
 from rig_protocol.errors import ConfigurationError, DataError
 from rig_protocol.frames import RgbdFrame
 from rig_protocol.rig_folder import CameraEntry, frame_indices, read_frame, read_rig_description
@@ -86,6 +86,10 @@ class FolderSource:
         number, self._next = self._next, self._next + 1
         frame = self._frame(self._indices[number % len(self._indices)])
         return replace(frame, sequence=number, timestamp_ns=number * self._interval_ns)
+
+    def control(self, name: str, value: ControlValue) -> str:
+        """There is nothing to set: ControlRefused."""
+        raise ControlRefused(f"a recording cannot set {name} to {value}")
 
     def close(self) -> None:
         """Forget the decoded frames."""

@@ -14,16 +14,18 @@ from typing import Self, cast
 
 from pydantic import Field
 
-from rig_agent.sources.base import SourceDescription, SourceLost
+from rig_agent.sources.base import ControlRefused, ControlValue, SourceDescription, SourceLost
 from rig_agent.sources.device_clock import DeviceClock
 from rig_agent.sources.factory_model import camera_model
 from rig_agent.sources.frame_pairing import ImagePair
 from rig_agent.sources.freenect_thread import FreenectThread
 from rig_agent.sources.libfreenect import load_libfreenect
 from rig_agent.usb import enumerate as usb_bus
+from rig_agent.usb.accelerometer import Accelerometer
 from rig_protocol.errors import RigError
 from rig_protocol.frames import ImageU8, ImageU16, RgbdFrame
 from rig_protocol.settings import Settings
+from rig_protocol.troubleshooting import Topic
 
 FPS = 30.0
 _STOP_LIMIT_S = 2.0  # stopping takes one poll of 0.1 s and a few commands
@@ -58,10 +60,14 @@ class FreenectSource:
         """
         _hanging[:] = [thread for thread in _hanging if not thread.stop(0)]
         if _hanging:
-            raise RigError("libfreenect hangs in a Kinect that stopped answering: start the agent anew")
+            raise RigError(
+                "libfreenect hangs in a Kinect that stopped answering: start the agent anew",
+                Topic.HANGING_KINECT,
+            )
         library = load_libfreenect(settings.library)
         self._timeout_s = settings.timeout_s
-        self._camera = _find(settings)
+        self._camera, motor = _find(settings)
+        self._accelerometer: Accelerometer | None = None
         self._clock = DeviceClock()
         self._sequence = 0
         self._damaged = 0
@@ -73,6 +79,7 @@ class FreenectSource:
         except RigError:
             self.close()
             raise
+        self._accelerometer = Accelerometer(motor)
         self._counters = self._thread.counters
         self._last_pair_s = time.monotonic()
         log.info("%s streams; depth model: %s", self._camera, self._model.source)
@@ -105,7 +112,7 @@ class FreenectSource:
         try:
             pair = self._thread.next_pair(timeout_s)
         except SourceLost as error:
-            raise SourceLost(f"{self._camera} is gone (cable or power?): {error}") from error
+            raise SourceLost(f"{self._camera} is gone (cable or power?): {error}", Topic.NO_KINECT) from error
         now_s = time.monotonic()
         if pair is not None:
             self._last_pair_s = now_s
@@ -114,12 +121,18 @@ class FreenectSource:
             raise SourceLost(f"{self._camera} has sent no images for {self._timeout_s:g} s")
         return None
 
+    def control(self, name: str, value: ControlValue) -> str:
+        """There is nothing to set: ControlRefused."""
+        raise ControlRefused(f"the Kinect cannot set {name} to {value}")
+
     def close(self) -> None:
         """Release the Kinect; takes a few seconds at most, whatever the device does."""
         if self._thread is None:
             return
         thread, self._thread = self._thread, None
         self._counters = thread.counters
+        if self._accelerometer is not None:
+            self._accelerometer.close()
         if thread.stop(_STOP_LIMIT_S):
             return
         log.warning("%s does not answer: resetting its USB port", self._camera)
@@ -150,11 +163,14 @@ class FreenectSource:
             bayer=cast(ImageU8, pair.video.image),
             raw=cast(ImageU16, pair.depth.image),
             damaged=damaged,
+            gravity=None if self._accelerometer is None else self._accelerometer.gravity,
         )
 
 
-def _find(settings: FreenectSettings) -> usb_bus.KinectCamera:
-    cameras = usb_bus.kinect_cameras(usb_bus.usb_devices())
+def _find(settings: FreenectSettings) -> tuple[usb_bus.KinectCamera, usb_bus.UsbDevice | None]:
+    """The camera to open, and the motor of the same Kinect where it has one."""
+    devices = usb_bus.usb_devices()
+    cameras = usb_bus.kinect_cameras(devices)
     camera = usb_bus.choose_camera(cameras, settings.serial, settings.port_path)
     usb_bus.check_access(camera)
-    return camera
+    return camera, usb_bus.motor_beside(camera, devices)

@@ -23,6 +23,7 @@ from rig_agent.sources.base import SourceLost
 from rig_agent.sources.frame_pairing import Stream, StreamImage
 from rig_protocol.errors import RigError
 from rig_protocol.frames import ImageU16
+from rig_protocol.troubleshooting import Topic
 
 WIDTH, HEIGHT = 640, 480
 
@@ -128,7 +129,10 @@ class FreenectDevice:
         video = library.freenect_find_video_mode(fn.RESOLUTION_MEDIUM, fn.VIDEO_BAYER)
         depth = library.freenect_find_depth_mode(fn.RESOLUTION_MEDIUM, fn.DEPTH_11BIT)
         if (video.bytes, depth.bytes) != (WIDTH * HEIGHT, 2 * WIDTH * HEIGHT):
-            raise RigError("this libfreenect offers no 640×480 Bayer and 11-bit depth: use libfreenect 0.5")
+            raise RigError(
+                "this libfreenect offers no 640×480 Bayer and 11-bit depth: use libfreenect 0.5",
+                Topic.MISSING_LIBRARY,
+            )
         self._check(library.freenect_set_video_mode(self._device, video), "choose Bayer")
         self._check(library.freenect_set_depth_mode(self._device, depth), "choose 11-bit depth")
 

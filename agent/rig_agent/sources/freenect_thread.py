@@ -14,6 +14,7 @@ from rig_agent.sources.frame_pairing import FramePairer, ImagePair, StreamImage
 from rig_agent.sources.freenect_device import FreenectDevice
 from rig_agent.sources.libfreenect import ZeroPlane
 from rig_protocol.errors import RigError
+from rig_protocol.troubleshooting import Topic
 
 # Pairs that wait for the reader: 130 ms at 30 Hz, 3.6 MB.
 _QUEUE_LIMIT = 4
@@ -59,7 +60,9 @@ class FreenectThread:
             if self._error:
                 raise self._error
             if not self._open:
-                raise SourceLost(f"the camera did not answer within {timeout_s:g} s of being opened")
+                raise SourceLost(
+                    f"the camera did not answer within {timeout_s:g} s of being opened", Topic.HANGING_KINECT
+                )
             return self._zero_plane
 
     def next_pair(self, timeout_s: float) -> ImagePair | None:

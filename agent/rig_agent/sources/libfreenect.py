@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from rig_protocol.errors import ConfigurationError
+from rig_protocol.troubleshooting import Topic
 
 RESOLUTION_MEDIUM = 1
 VIDEO_BAYER = 1
@@ -104,7 +105,9 @@ def load_libfreenect(path: Path | None = None) -> c.CDLL:
     library = _open(path)
     missing = [name for name in _SIGNATURES if not hasattr(library, name)]
     if missing:
-        raise ConfigurationError(f"{library._name} is no usable libfreenect: it lacks {', '.join(missing)}")
+        raise ConfigurationError(
+            f"{library._name} is no usable libfreenect: it lacks {', '.join(missing)}", Topic.MISSING_LIBRARY
+        )
     for name, (result, arguments) in (_SIGNATURES | _OPTIONAL_SIGNATURES).items():
         if hasattr(library, name):
             function = getattr(library, name)
@@ -138,5 +141,6 @@ def _open(path: Path | None) -> c.CDLL:
             reasons.append(str(error))
     raise ConfigurationError(
         f"libfreenect cannot be loaded ({reasons[0]}): apt install libfreenect0.5, "
-        "or give its path as `library` in [freenect]"
+        "or give its path as `library` in [freenect]",
+        Topic.MISSING_LIBRARY,
     )

@@ -8,7 +8,7 @@ from typing import Self
 
 from rig_agent.simulator.ring import VirtualRig
 from rig_agent.simulator.settings import SimulatorSettings
-from rig_agent.sources.base import SourceDescription
+from rig_agent.sources.base import ControlRefused, ControlValue, SourceDescription
 from rig_protocol.frames import RgbdFrame
 
 
@@ -72,6 +72,10 @@ class SyntheticSource:
             self._sleep(wait_s)
         number, self._next = self._next, self._next + 1
         return replace(self._kinect.frame(number), timestamp_ns=taken_ns)
+
+    def control(self, name: str, value: ControlValue) -> str:
+        """There is nothing to set: ControlRefused."""
+        raise ControlRefused(f"the simulator cannot set {name} to {value}")
 
     def close(self) -> None:
         """Nothing to release."""

@@ -11,10 +11,11 @@ from typing import Any
 
 from rig_agent.sources.base import SourceLost
 from rig_protocol.errors import ConfigurationError
+from rig_protocol.troubleshooting import Topic
 
 MICROSOFT = 0x045E
 CAMERA_1414_1473, CAMERA_K4W = 0x02AE, 0x02BF
-MOTORS = (0x02B0, 0x02C2)
+MOTOR_1414 = 0x02B0
 AUDIO = (0x02AD, 0x02BE, 0x02BB, 0x02C3)
 _REVISION_1414 = 0x010B  # of the device descriptor; libfreenect tells the models apart by it too
 
@@ -22,6 +23,8 @@ _REVISION_1414 = 0x010B  # of the device descriptor; libfreenect tells the model
 _LIBUSB = "libusb-1.0.so.0"
 
 log = logging.getLogger(__name__)
+
+_TOPICS = {"access": Topic.NO_PERMISSION, "busy": Topic.KINECT_IN_USE, "gone": Topic.NO_KINECT}
 
 UsbDevice = Any
 """A `usb.core.Device`; pyusb ships no types."""
@@ -59,7 +62,9 @@ def usb_devices() -> list[UsbDevice]:
     libusb._lib_object = None
     backend = libusb.get_backend(find_library=lambda _name: _LIBUSB)
     if backend is None:
-        raise ConfigurationError(f"{_LIBUSB} cannot be loaded: apt install libusb-1.0-0")
+        raise ConfigurationError(
+            f"{_LIBUSB} cannot be loaded: apt install libusb-1.0-0", Topic.MISSING_LIBRARY
+        )
     return list(usb.core.find(find_all=True, idVendor=MICROSOFT, backend=backend))
 
 
@@ -104,8 +109,16 @@ def choose_camera(cameras: Sequence[KinectCamera], serial: str | None, port_path
         f"no Kinect {wanted} is connected, but {listed}. Plug it in, or correct [freenect]"
         if cameras
         else "no Kinect's camera is on the USB bus: check the cable and the Kinect's own power supply "
-        "(`lsusb -d 045e:` lists it; motor without camera means: no power)"
+        "(`lsusb -d 045e:` lists it; motor without camera means: no power)",
+        Topic.NO_KINECT,
     )
+
+
+def motor_beside(camera: KinectCamera, devices: Iterable[UsbDevice]) -> UsbDevice | None:
+    """The motor of the same Kinect, which holds its accelerometer; None for models without such a device."""
+    hub = _hub(camera.device)
+    beside = (device for device in devices if device.idProduct == MOTOR_1414 and _hub(device) == hub)
+    return None if hub is None else next(beside, None)
 
 
 def check_access(camera: KinectCamera) -> None:
@@ -117,7 +130,7 @@ def check_access(camera: KinectCamera) -> None:
         if not camera.device.is_kernel_driver_active(0):  # libfreenect detaches that driver itself
             usb.util.claim_interface(camera.device, 0)
     except usb.core.USBError as error:
-        raise SourceLost(_advice(camera, error)) from error
+        raise SourceLost(_advice(camera, error), _TOPICS.get(_kind_of(error))) from error
     finally:
         usb.util.dispose_resources(camera.device)
 

@@ -86,6 +86,9 @@ def key_figures(calibration: RigCalibration, expected: int) -> dict[str, str]:
     if loop is not None:
         figures["loop before"] = f"{loop.before_deg:.2f}° / {loop.before_mm:.1f} mm"
         figures["loop after"] = f"{loop.after_deg:.2f}° / {loop.after_mm:.1f} mm"
+    felt = calibration.provenance.get("gravity_cameras")
+    if isinstance(felt, list):
+        figures["down felt by"] = f"{len(felt)} of {expected} cameras"
     if "total" in calibration.seconds:
         figures["calibration time"] = f"{calibration.seconds['total']:.1f} s"
     return figures

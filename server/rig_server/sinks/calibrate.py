@@ -4,6 +4,7 @@ from collections.abc import Iterable, Sequence
 
 from rig_protocol.errors import RigError
 from rig_protocol.frames import PanoramicFrame
+from rig_protocol.troubleshooting import Topic
 
 
 class CalibrateSink:
@@ -41,7 +42,8 @@ class CalibrateSink:
         if not (self._complete or self._partial):
             raise RigError(
                 "the cameras are connected but no frame has arrived: look at `journalctl -u 'rig-agent@*'` "
-                "on their machines"
+                "on their machines",
+                Topic.NO_FRAMES,
             )
         spare = self._partial[: self._count - len(self._complete)]
         chosen = sorted([*self._complete, *spare], key=lambda panorama: panorama.index)

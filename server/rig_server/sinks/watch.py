@@ -13,6 +13,7 @@ from rig_calib.drift.words import camera_names, moved_message
 from rig_calib.rig_calibration import RigCalibration
 from rig_protocol.frames import PanoramicFrame
 from rig_protocol.rig_folder import RigDescription
+from rig_protocol.troubleshooting import Topic, see
 from rig_server.metrics import DriftReport
 
 logger = logging.getLogger(__name__)
@@ -82,7 +83,7 @@ class WatchSink:
         """Say in the log which cameras are newly found to have moved, or to be in place again."""
         moved = {camera.camera: camera for camera in status.moved}
         for k in sorted(moved.keys() - self._moved):
-            logger.error("%s", moved_message(moved[k], self._names))
+            logger.error("%s", moved_message(moved[k], self._names), extra=see(Topic.CAMERA_MOVED))
         for k in sorted(self._moved - moved.keys()):
             logger.warning("%s is in its place again", self._names.get(k, k))
         self._moved = frozenset(moved)

@@ -169,6 +169,7 @@ static void read_faults(struct kinect *kinect)
     faults->deny = has(kinect, "deny");
     faults->busy = has(kinect, "busy");
     faults->mute = has(kinect, "mute");
+    faults->mute_motor = has(kinect, "mute_motor");
     faults->stall = has(kinect, "stall");
     kinect_read_line(kinect, "lose", line, sizeof line);
     faults->lose_percent = atof(line);

@@ -1,4 +1,4 @@
-/* libusb API: control and bulk transfers, which are answered at once unless the camera is mute. */
+/* libusb API: control and bulk transfers, which are answered at once unless camera or motor is mute. */
 #include "virtual_usb.h"
 
 #include <string.h>
@@ -44,7 +44,13 @@ int libusb_get_string_descriptor_ascii(
     return result;
 }
 
-/* Wait while the camera does not answer: until cured, reset (EIO), unplugged or timed out. */
+static bool is_mute(const struct libusb_device *device)
+{
+    const struct faults *faults = &device->kinect->faults;
+    return (device->function == CAMERA && faults->mute) || (device->function == MOTOR && faults->mute_motor);
+}
+
+/* Wait while the device does not answer: until cured, reset (EIO), unplugged or timed out. */
 static int wait_for_answer(libusb_device_handle *handle, unsigned timeout_ms)
 {
     struct kinect *kinect = handle->device->kinect;
@@ -53,7 +59,7 @@ static int wait_for_answer(libusb_device_handle *handle, unsigned timeout_ms)
     kinect->next_refresh_ns = 0; /* a fault just made must hold */
     uint64_t resets = kinect->resets;
     int result = 0;
-    while (!result && handle_alive(handle) && kinect->faults.mute) {
+    while (!result && handle_alive(handle) && is_mute(handle->device)) {
         bus_unlock();
         sleep_ns(POLL_NS);
         bus_lock();
@@ -84,7 +90,7 @@ int libusb_control_transfer(
     struct kinect *kinect = handle->device->kinect;
     int result = LIBUSB_ERROR_PIPE;
     bool for_string = type == DEVICE_TO_HOST && request == GET_DESCRIPTOR && value >> 8 == STRING_DESCRIPTOR;
-    if (handle->device->function == CAMERA && !for_string)
+    if (!for_string)
         result = wait_for_answer(handle, timeout_ms);
     if (result < 0 && result != LIBUSB_ERROR_PIPE)
         return result;

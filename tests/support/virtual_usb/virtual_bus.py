@@ -8,6 +8,7 @@ A bus is a folder with one numbered folder (0 to 7) for each Kinect. In it, the 
     first_tick                         the 60-MHz clock at power-on
     deny, busy, mute, stall            faults: no permission; claimed by another program; never answers
                                        (a USB reset cures it); sends no images
+    mute_motor                         fault: the motor, and so the accelerometer, never answers
     lose                               percent of image packets lost at random
     lose_video_packet, …_depth_…       "p n": packet p of every n-th frame is lost
 and the library appends to `log` what the driver commanded. Environment: VKINECT_DIR is the bus,

@@ -65,6 +65,7 @@ struct faults {
     bool deny;                /* opening fails with EACCES */
     bool busy;                /* another program has claimed the camera */
     bool mute;                /* the camera never answers control transfers; a reset cures it */
+    bool mute_motor;          /* the motor never answers control transfers */
     bool stall;               /* isochronous packets stay empty */
     double lose_percent;      /* of isochronous packets, at random */
     int lose_packet[STREAMS]; /* this packet (-1: none) ... */

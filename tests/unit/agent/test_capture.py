@@ -16,6 +16,7 @@ from rig_agent.sources.base import SourceDescription, SourceLost
 from rig_protocol.camera import CameraModel
 from rig_protocol.errors import DataError
 from rig_protocol.frames import RgbdFrame
+from rig_protocol.gravity import Gravity
 
 DESCRIPTION = SourceDescription("A1", "1-1", CameraModel(), 30.0, "bayer", "raw")
 INTERVAL_NS = 33_333_333
@@ -281,3 +282,14 @@ def test_a_source_whose_count_goes_back_counts_on(start: Start) -> None:
     """As that of a recording, which follows from the clock, when the clock is set back."""
     _, recorder = start(frames(50, 51, 52, 3, 4, 6))
     assert [frame.sequence for frame in recorder.take(6)] == [0, 1, 2, 3, 4, 6]
+
+
+def test_the_capture_knows_what_its_source_felt_last_and_forgets_it_with_the_source(start: Start) -> None:
+    felt = Gravity((0.0, 1.0, 0.0))
+    still: list[Step] = [RgbdFrame(0, 0, 0), RgbdFrame(0, 1, INTERVAL_NS, gravity=felt)]
+    capture, recorder = start(still)
+    recorder.take(2)
+    assert capture.gravity == felt
+    lost, recorder = start([*still, SourceLost("unplugged")], SourceLost("still away"), frames(0))
+    recorder.take(3)
+    assert lost.gravity is None

@@ -10,16 +10,18 @@ from rig_agent.sources.folder import FolderSource
 from rig_protocol.camera import CameraModel
 from rig_protocol.errors import ConfigurationError, DataError
 from rig_protocol.frames import RgbdFrame
+from rig_protocol.gravity import Gravity
 from rig_protocol.rig_folder import CameraEntry, RigDescription, write_rig_folder
 from support.real_data import real_data
 from support.virtual_time import VirtualTime
 
 INTERVAL_NS = 100_000_000
+FELT = Gravity((0.6, 0.8, 0.0))
 
 
 def make_frame(index: int) -> RgbdFrame:
     image = np.full((48, 64), index, np.uint8)
-    return RgbdFrame(7, index, 0, color=np.dstack([image] * 3), raw=image.astype(np.uint16))
+    return RgbdFrame(7, index, 0, color=np.dstack([image] * 3), raw=image.astype(np.uint16), gravity=FELT)
 
 
 @pytest.fixture
@@ -43,6 +45,13 @@ def shown(source: FolderSource) -> int:
 def test_frames_loop_in_order(folder: Path) -> None:
     source = open_folder(folder, VirtualTime())
     assert [shown(source) for _ in range(7)] == [1, 2, 0, 1, 2, 0, 1]
+
+
+def test_frames_carry_what_the_camera_felt_when_they_were_recorded(folder: Path) -> None:
+    frame = open_folder(folder, VirtualTime()).read(1.0)
+    assert frame is not None
+    assert frame.gravity is not None
+    assert frame.gravity.down == pytest.approx(FELT.down)
 
 
 def test_frames_come_at_the_rate_stamped_when_due(folder: Path) -> None:

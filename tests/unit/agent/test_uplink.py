@@ -13,7 +13,8 @@ from rig_agent.uplink import Uplink, Wanted
 from rig_protocol.camera import CameraModel
 from rig_protocol.datagram import DatagramBatch, parse_fragment_header
 from rig_protocol.frames import EncodedFrame
-from rig_protocol.messages import ClockRequest, Goodbye, Resend, StreamPlan
+from rig_protocol.gravity import Gravity
+from rig_protocol.messages import ClockRequest, Goodbye, Heartbeat, Resend, StreamPlan
 from rig_protocol.rig_key import RigKey
 from support.peers import ServerPeer
 from support.wire import COLOR, DEPTH, KEY, make_frame
@@ -226,6 +227,14 @@ def test_a_lost_session_drops_what_is_unsent_and_its_plan(transport: MemoryTrans
     transport.arrived.append(connected_again.seal(ClockRequest(0)))
     uplink.serve(0)
     assert uplink.wanted == Wanted(4, COLOR, DEPTH, None)
+
+
+def test_what_the_camera_feels_is_told_to_the_server(transport: MemoryTransport, uplink: Uplink) -> None:
+    server, felt = connected(transport, uplink), Gravity((0.0, 1.0, 0.0))
+    transport.sent.clear()
+    uplink.report_gravity(felt)
+    uplink.serve(1)
+    assert Heartbeat({}, gravity=felt) in server.read(transport.sent)
 
 
 def test_a_server_with_another_key_gets_no_frame(transport: MemoryTransport, uplink: Uplink) -> None:

@@ -245,7 +245,7 @@ def test_gravity_ties_the_tilt_of_cameras_that_share_no_view() -> None:
     down /= np.linalg.norm(down)
     truth = [rig.truth[0], rig.truth[1]]
     tilted = truth[1] @ se3_exp(np.array([0.03, 0.01, -0.02, 0, 0, 0]))
-    loose = {"pose_sigma": np.repeat([np.deg2rad(2.0), 0.01], 3)}
+    loose = {"pose_sigma": np.repeat([np.deg2rad(2.0), 0.01], 3), "gravity_sigma": np.deg2rad(0.5)}
     cameras = [
         replace(camera, gravity=T[:3, :3].T @ down, T_prior=start, **loose)
         for camera, T, start in zip(

@@ -61,6 +61,13 @@ def depthless(camera_id: int) -> Callable[[SyntheticCamera], SyntheticCamera]:
     return lambda camera: camera.without_depth() if camera.view.camera_id == camera_id else camera
 
 
+def hide_overlap(rig: SyntheticRig, azimuth_deg: float) -> None:
+    """Take away what is seen around a direction from the rig's middle."""
+    middle = np.arctan2(rig.world[:, 1], rig.world[:, 0])
+    off = np.abs((middle - np.deg2rad(azimuth_deg) + np.pi) % (2 * np.pi) - np.pi)
+    rig.world[off < np.deg2rad(14.0)] = (0.0, 0.0, 9.0)
+
+
 def nominal_poses(rig: SyntheticRig) -> dict[int, Pose]:
     return {c: rig.drawing.T_rig_camera(c) for c in range(rig.cameras)}
 
@@ -131,6 +138,41 @@ def test_a_rig_without_a_drawing_is_calibrated_relative_to_camera_0(solve: Calib
     assert not np.any(calibration.cameras[0].covariance)
 
 
+def test_gravity_is_weighed_as_its_view_says_and_the_calibration_tells_who_felt_it(
+    solve: Calibrate,
+) -> None:
+    """A camera that nobody matches: its mount leaves its tilt open, its accelerometer says it."""
+    rig = SyntheticRig(cameras=4)
+    down = np.array([0.0, 0.0, -1.0])
+
+    def felt(sigma_deg: float) -> CalibrationResult:
+        views = [
+            replace(view, gravity=rig.truth[c][:3, :3].T @ down, gravity_sigma_deg=sigma_deg)
+            for c, view in enumerate(rig.views())
+        ]
+        return solve(rig, views, change=blind(3))
+
+    silent, vague, sure = solve(rig, change=blind(3)), felt(10.0), felt(0.05)
+    assert "gravity_cameras" not in silent.calibration.provenance
+    assert sure.calibration.provenance["gravity_cameras"] == [0, 1, 2, 3]
+    tilts = [_tilt_sigma_deg(result, 3) for result in (silent, vague, sure)]
+    assert tilts[1] > 0.95 * tilts[0]
+    assert tilts[2] < 0.5 * tilts[0]
+
+
+def _tilt_sigma_deg(result: CalibrationResult, camera: int) -> float:
+    """About the optical axis, which lies level: relative to camera 0's frame, so that only tilt counts."""
+    assert result.rig is not None
+    return float(np.rad2deg(np.sqrt(result.rig.relative(0, camera)[1][2, 2])))
+
+
+def test_the_papers_method_tells_of_no_gravity(solve: Calibrate) -> None:
+    rig = SyntheticRig(cameras=3)
+    views = [replace(view, gravity=np.array([1.0, 0.0, 0.0])) for view in rig.views()]
+    calibration = solve(rig, views, SETTINGS.model_copy(update={"method": "paper"})).calibration
+    assert "gravity_cameras" not in calibration.provenance
+
+
 def test_the_same_input_gives_bit_identical_cameras_and_edges(solve: Calibrate) -> None:
     rig = SyntheticRig(cameras=4)
     first, second = (solve(rig).calibration.to_dict() for _ in range(2))
@@ -192,14 +234,33 @@ def test_with_a_drawing_a_camera_that_matches_nobody_is_as_uncertain_as_its_moun
 
 def test_a_missing_overlap_is_warned_about_while_the_other_way_round_holds(solve: Calibrate) -> None:
     rig = SyntheticRig()
-    middle = np.arctan2(rig.world[:, 1], rig.world[:, 0])
-    hidden = np.abs(middle - np.deg2rad(75.0)) < np.deg2rad(14.0)  # between cameras 2 and 3
-    rig.world[hidden] = (0.0, 0.0, 9.0)
+    hide_overlap(rig, 75.0)  # between cameras 2 and 3
     calibration = solve(rig).calibration
     assert calibration.failures == ()
     assert any("edge 2–3: of 0 matches" in warning for warning in calibration.warnings)
     assert any("no loop confirms" in warning for warning in calibration.warnings)
     assert len(calibration.cameras) == 12
+
+
+def test_two_broken_overlaps_leave_two_chains_placed_each_well_and_apart_as_the_drawing_allows(
+    solve: Calibrate,
+) -> None:
+    rig = SyntheticRig()
+    hide_overlap(rig, 75.0)  # between cameras 2 and 3
+    hide_overlap(rig, 255.0)  # between cameras 8 and 9
+    calibration = solve(rig).calibration
+    assert len(calibration.cameras) == 12
+    assert {"2–3", "8–9"} == {failure.split("edge ")[1][:3] for failure in calibration.failures}
+    errors = evaluate(calibration, rig.truth).pairs
+    sigma_deg = {
+        (edge.i, edge.j): np.rad2deg(np.sqrt(np.diag(edge.relative_covariance)[:3].max()))
+        for edge in calibration.edges
+        if edge.relative_covariance is not None
+    }
+    within, across = (4, 5), (2, 3)
+    assert errors[within].deg < 0.2
+    assert sigma_deg[within] < 0.2 < sigma_deg[across] < rig.drawing.tolerance_deg
+    assert errors[across].deg < 4.0 * sigma_deg[across]
 
 
 def test_a_plausible_false_edge_is_dropped_with_a_reason(solve: Calibrate) -> None:

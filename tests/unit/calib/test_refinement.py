@@ -127,6 +127,28 @@ def test_pairs_of_depth_only_carry_no_pixel_information(
     assert all(found.cameras[c].depth.known.mean() > 0.5 for c in PAIR)
 
 
+def test_a_patch_whose_depth_may_be_the_walls_behind_a_thing_is_not_taken(
+    cameras: Mapping[int, ObservedCamera], regions: Regions, refined: RefinedRig
+) -> None:
+    """Beside a hole or a step the depth of one place says little of the texture around it."""
+    torn = {c: replace(camera, disparity=camera.disparity.copy()) for c, camera in cameras.items()}
+    for camera in torn.values():
+        camera.disparity[::6] = np.nan  # two or three of a patch's fifteen rows: a plane fits all the same
+    there = refine(torn, regions, poses_off(), NO_CORRECTION, PREDICTION_PX)
+    assert len(refined.matches[PAIR]) > 100
+    assert len(there.matches[PAIR]) == 0
+
+
+def test_textures_are_found_where_the_poses_are_right_and_hardly_where_they_are_wrong(
+    cameras: Mapping[int, ObservedCamera], regions: Regions, refined: RefinedRig
+) -> None:
+    aside = se3_exp(np.array([0.0, 0.0, 0.0, 0.15, 0.0, 0.0]))
+    wrong = {0: poses_off()[0], 1: poses_off()[1] @ aside}
+    elsewhere = refine(cameras, regions, wrong, NO_CORRECTION, PREDICTION_PX)
+    assert refined.found_share[PAIR] > 0.7
+    assert elsewhere.found_share[PAIR] < 0.3
+
+
 def test_a_place_is_not_taken_twice(refined: RefinedRig) -> None:
     rows = refined.matches[PAIR]
     for side, c in enumerate(PAIR):

@@ -241,6 +241,13 @@ def test_every_camera_and_every_edge_has_its_row(page: str) -> None:
         assert f"cam{k:02d} – cam{(k + 1) % 12:02d}" in text
 
 
+def test_the_key_figures_tell_how_many_accelerometers_were_heard() -> None:
+    known = good_calibration()
+    assert "down felt by" not in tables.key_figures(known, 12)
+    felt = replace(known, provenance={**known.provenance, "gravity_cameras": [0, 1, 5]})
+    assert tables.key_figures(felt, 12)["down felt by"] == "3 of 12 cameras"
+
+
 def test_matches_residuals_loop_time_and_settings_are_there(page: str) -> None:
     text = PageReader(page).text
     for part in (

@@ -13,6 +13,7 @@ from rig_calib import calibration as pipeline
 from rig_calib.calibration import calibrate
 from rig_calib.cli import main
 from rig_calib.observed_camera import ObservedCamera
+from rig_calib.rig_folder_calibration import solve_folder
 from rig_calib.settings import CalibrationSettings
 from rig_calib.view import CameraView
 from rig_protocol.poses import se3_exp
@@ -41,6 +42,22 @@ def write_folder(folder: Path, rig: SyntheticRig) -> Path:
         cv2.imwrite(str(folder / entry.name / "raw_000.png"), NO_DEPTH)
     (folder / "nominal.json").write_text(json.dumps(RigDescription(entries, rig.drawing).to_dict()))
     return folder
+
+
+def test_what_accelerometers_felt_comes_from_the_folder_to_the_calibration(
+    rig: SyntheticRig, tmp_path: Path
+) -> None:
+    folder = write_folder(tmp_path / "rig", rig)
+    values = json.loads((folder / "nominal.json").read_text())
+    for c in (0, 2):
+        down = rig.truth[c][:3, :3].T @ np.array([0.0, 0.0, -1.0])
+        values["cameras"][c]["gravity"] = {"down": down.tolist(), "sigma_deg": 1.0}
+    (folder / "nominal.json").write_text(json.dumps(values))
+    result, views = solve_folder(folder, CalibrationSettings())
+    assert [None if view.gravity is None else view.gravity_sigma_deg for view in views] == [1.0, None, 1.0]
+    provenance = result.calibration.provenance
+    assert provenance["gravity_cameras"] == [0, 2]
+    assert provenance["source"] == "folder"
 
 
 def run(monkeypatch: pytest.MonkeyPatch, *words: object) -> int:

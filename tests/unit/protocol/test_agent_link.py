@@ -14,6 +14,7 @@ from rig_protocol.datagram import MAGIC, MessageType
 from rig_protocol.errors import LinkUsageError
 from rig_protocol.events import Connected, Disconnected, Rejected
 from rig_protocol.frames import Payload
+from rig_protocol.gravity import Gravity
 from rig_protocol.message_bytes import encode_body
 from rig_protocol.messages import (
     WHOLE_FRAME,
@@ -202,6 +203,17 @@ def test_a_heartbeat_tells_how_many_frames_have_left_whole(left_of_the_last: int
     batches = [agent.send_frame(make_frame(k), T0) for k in range(3)]
     agent.frames_to_resend(lambda batch: left_of_the_last if batch is batches[-1] else len(batch))
     assert sent(agent, server, T0 + HEARTBEAT_INTERVAL_NS) == [Heartbeat({}, told)]
+
+
+def test_heartbeats_tell_gravity_at_once_when_it_is_felt_and_when_it_is_not_any_more() -> None:
+    agent, server = connected()
+    agent.gravity = Gravity((0.0, 1.0, 0.0))
+    assert sent(agent, server, T0 + 1) == [Heartbeat({}, gravity=agent.gravity)]
+    agent.gravity = Gravity((0.0, 0.0, 1.0))
+    assert sent(agent, server, T0 + 2) == []
+    assert sent(agent, server, T0 + 1 + HEARTBEAT_INTERVAL_NS) == [Heartbeat({}, gravity=agent.gravity)]
+    agent.gravity = None
+    assert sent(agent, server, T0 + 2 + HEARTBEAT_INTERVAL_NS) == [Heartbeat({})]
 
 
 def test_health_against_the_limits_is_misuse() -> None:

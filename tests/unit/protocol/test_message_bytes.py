@@ -7,6 +7,7 @@ import pytest
 from rig_protocol.camera import CameraModel, Intrinsics
 from rig_protocol.datagram import MessageType
 from rig_protocol.errors import DataError, LinkUsageError
+from rig_protocol.gravity import Gravity
 from rig_protocol.message_bytes import (
     HELLO_OVERHEAD,
     MAX_CONTROL_SIZE,
@@ -46,6 +47,7 @@ SIMPLE: list[Message] = [
     ClockReply(1, 2, 3, -(2**63), 2**64 - 2),
     UnknownSession(),
     Heartbeat({}, 2**64 - 1),
+    Heartbeat({"load": 2.0}, 7, Gravity((0.6, -0.8, 0.0), 1.5)),
     Resend(2**64 - 1, ((0, 1), (7, 3), (65535, 65535))),
     Resend(0, WHOLE_FRAME),
     StreamPlan(2, None, 14.5, 1_000_000, 999_999, 0.05, -(2**63)),
@@ -273,6 +275,22 @@ def test_a_heartbeat_counts_frames(frames: Any) -> None:
         decode(MessageType.HEARTBEAT, {"health": {}, "frames": frames})
 
 
+def test_an_agent_without_accelerometer_sends_the_heartbeat_that_it_always_sent() -> None:
+    _, body = encode_body(Heartbeat({"load": 2.0}, 7))
+    assert msgpack.unpackb(body) == {"health": {"load": 2.0}, "frames": 7}
+
+
+def test_a_heartbeat_without_gravity_or_with_nil_is_one_of_a_camera_that_feels_none() -> None:
+    for values in ({}, {"gravity": None}):
+        assert decode(MessageType.HEARTBEAT, {"health": {}, "frames": 0, **values}) == Heartbeat({})
+
+
+@pytest.mark.parametrize("gravity", [[0, 1, 0], {}, {"down": [0, 0, 0], "sigma_deg": 1}, 7], ids=str)
+def test_a_heartbeat_with_malformed_gravity_is_malformed(gravity: Any) -> None:
+    with pytest.raises(DataError, match="gravity"):
+        decode(MessageType.HEARTBEAT, {"health": {}, "frames": 0, "gravity": gravity})
+
+
 @pytest.mark.parametrize(
     "body",
     [
@@ -319,7 +337,7 @@ def test_a_control_message_is_at_most_1200_bytes() -> None:
     for message in (
         widest,
         Resend(1, ((5, 1),) * MAX_RANGES),
-        Heartbeat({f"{i:032}": 1.0 for i in range(16)}),
+        Heartbeat({f"{i:032}": 1.0 for i in range(16)}, 2**64 - 1, Gravity((0.6, -0.8, 0.0), 1.5)),
     ):
         assert HELLO_OVERHEAD + len(encode_body(message)[1]) <= MAX_CONTROL_SIZE
 

@@ -10,6 +10,7 @@ import pytest
 from rig_protocol.camera import CameraModel
 from rig_protocol.errors import ConfigurationError, DataError
 from rig_protocol.frames import RgbdFrame
+from rig_protocol.gravity import Gravity
 from rig_protocol.rig_folder import (
     CameraEntry,
     RigDescription,
@@ -49,6 +50,34 @@ def test_a_folder_gives_back_what_was_written(tmp_path: Path) -> None:
     np.testing.assert_array_equal(second.color, COLOR[..., 0])
     np.testing.assert_array_equal(second.depth_mm, RAW)
     assert (first.depth_frame, second.depth_frame) == ("depth", "color")
+
+
+def test_what_the_cameras_felt_is_in_the_folder_and_in_the_frames_read_from_it(tmp_path: Path) -> None:
+    felt = Gravity((0.6, 0.8, 0.0), 2.0)
+    frames = [RgbdFrame(0, k, 0, color=COLOR, gravity=felt) for k in range(2)] + [
+        RgbdFrame(1, 0, 0, color=COLOR)
+    ]
+    write_rig_folder(tmp_path, description(), frames)
+    again = read_rig_description(tmp_path)
+    assert read_frame(tmp_path, again.camera(0), 1).gravity == felt
+    assert read_frame(tmp_path, again.camera(1), 0).gravity is None
+    cameras = json.loads((tmp_path / "nominal.json").read_text())["cameras"]
+    assert [camera.get("gravity") for camera in cameras] == [felt.to_dict(), None]
+    assert "gravity" not in cameras[1]
+
+
+def test_a_camera_that_was_turned_between_its_frames_has_no_gravity_in_the_folder(tmp_path: Path) -> None:
+    downs = (Gravity((1.0, 0.0, 0.0)), Gravity((0.0, 1.0, 0.0)))
+    frames = [RgbdFrame(0, k, 0, color=COLOR, gravity=down) for k, down in enumerate(downs)]
+    write_rig_folder(tmp_path, description(1), frames)
+    assert read_rig_description(tmp_path).camera(0).gravity is None
+
+
+def test_malformed_gravity_names_the_camera() -> None:
+    values = description().to_dict()
+    values["cameras"][1]["gravity"] = {"down": [0, 0, 0], "sigma_deg": 1}
+    with pytest.raises(DataError, match="camera 1: gravity"):
+        RigDescription.from_dict(values)
 
 
 def test_raw_disparity_is_preferred_to_millimetres(tmp_path: Path) -> None:

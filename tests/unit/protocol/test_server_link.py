@@ -4,13 +4,17 @@ from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
+import msgpack
 import pytest
 
+from rig_protocol.agent_link import AgentLink
+from rig_protocol.agent_session import HEARTBEAT_INTERVAL_NS
 from rig_protocol.datagram import MAGIC, Buffer, DatagramBatch, MessageType, pack_prefix
 from rig_protocol.errors import LinkUsageError
 from rig_protocol.event_queue import MAX_FRAMES
 from rig_protocol.events import CameraJoined, CameraLeft, FrameReceived, Rejected
-from rig_protocol.frames import Payload
+from rig_protocol.frames import EncodedFrame, Payload
+from rig_protocol.gravity import Gravity
 from rig_protocol.message_bytes import encode_body
 from rig_protocol.messages import (
     ClockReply,
@@ -24,6 +28,7 @@ from rig_protocol.messages import (
     UnknownSession,
 )
 from rig_protocol.server_link import ServerLink
+from rig_protocol.server_session import GRAVITY_AGE_NS
 from support.peers import AgentPeer
 from support.server_sessions import (
     HELLO,
@@ -448,3 +453,43 @@ def test_when_the_rig_clock_is_set_back_all_agents_are_asked_to_come_again() -> 
     (datagram, address), _ = server.datagrams_to_send(T0)  # and that it has no session any more
     assert (peer.read([datagram]), address) == ([Goodbye("the rig clock was set back")], AGENT)
     joined_peer(server, now_ns=T0, seed=9)
+
+
+# ---- gravity
+
+
+def frame_after(server: ServerLink, agent: AgentLink, sequence: int, now_ns: int) -> EncodedFrame:
+    deliver(server, agent, now_ns, sequence=sequence)
+    [frame] = [event.frame for event in events_of(server) if isinstance(event, FrameReceived)]
+    return frame
+
+
+def test_a_frame_carries_what_the_latest_heartbeat_told_of_gravity() -> None:
+    server = make_server()
+    agent = joined(server)
+    told = (Gravity((0.0, 1.0, 0.0)), Gravity((1.0, 0.0, 0.0)), None)
+    for k, gravity in enumerate(told):
+        now_ns = T0 + (k + 1) * HEARTBEAT_INTERVAL_NS
+        agent.gravity = gravity
+        roundtrip(agent, server, now_ns=now_ns)
+        assert frame_after(server, agent, k, now_ns).gravity == gravity
+
+
+def test_gravity_that_was_told_long_ago_says_nothing_of_a_frame() -> None:
+    server = make_server()
+    agent = joined(server)
+    agent.gravity = Gravity((0.0, 1.0, 0.0))
+    told_ns = T0 + HEARTBEAT_INTERVAL_NS
+    roundtrip(agent, server, now_ns=told_ns)
+    # No heartbeat comes any more, but frames do.
+    late_ns = told_ns + GRAVITY_AGE_NS
+    assert frame_after(server, agent, 0, late_ns - SECOND_NS).gravity == agent.gravity
+    assert frame_after(server, agent, 1, late_ns + 1).gravity is None
+
+
+def test_a_heartbeat_with_hostile_gravity_is_counted_and_tells_nothing() -> None:
+    server = make_server()
+    peer = joined_peer(server)
+    body = msgpack.packb({"health": {}, "frames": 0, "gravity": {"down": [0, 0, 0], "sigma_deg": 1}})
+    server.receive_datagram(peer.seal_body(MessageType.HEARTBEAT, body), AGENT, T0)
+    assert server.rejected == {"malformed": 1}

@@ -3,6 +3,7 @@
 import logging
 import threading
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from queue import Queue
 
 import numpy as np
@@ -12,6 +13,7 @@ from rig_agent.encoder import encode_frame
 from rig_protocol.codecs import codec_by_name
 from rig_protocol.errors import DataError
 from rig_protocol.frames import EncodedFrame, Payload, RgbdFrame
+from rig_protocol.gravity import Gravity
 from rig_server.decoder import FrameDecoder, decode_frame
 from support.images import scene
 
@@ -194,3 +196,10 @@ def test_closing_forgets_what_waits_and_waits_for_what_runs(
 def test_a_decoder_without_threads_or_room_is_refused(options: dict[str, int]) -> None:
     with pytest.raises(ValueError, match="must be positive"):
         FrameDecoder(lambda _: None, **options)
+
+
+def test_a_frame_keeps_what_is_known_beside_its_images() -> None:
+    felt = Gravity((0.0, 1.0, 0.0))
+    frame = decode_frame(replace(encoded(3, 5), uncertainty_ns=7, received_ns=9, damaged=True, gravity=felt))
+    assert (frame.camera_id, frame.sequence, frame.uncertainty_ns, frame.received_ns) == (3, 5, 7, 9)
+    assert (frame.damaged, frame.gravity) == (True, felt)

@@ -8,7 +8,7 @@ import usb.core
 import usb.util
 
 from rig_agent.sources.base import SourceLost
-from rig_agent.usb.enumerate import KinectCamera, choose_camera, kinect_cameras
+from rig_agent.usb.enumerate import KinectCamera, choose_camera, kinect_cameras, motor_beside
 from rig_protocol.errors import ConfigurationError
 
 ZEROS = "0000000000000000"
@@ -114,3 +114,10 @@ def test_two_kinects_and_no_choice_lists_them() -> None:
         ConfigurationError, match=r"A1 \(1414\) at USB 1-1\.1; Kinect A2 \(1414\) at USB 1-12\.1"
     ):
         choose_camera(cameras(), None, None)
+
+
+def test_the_motor_is_that_of_the_same_kinect_where_models_are_mixed() -> None:
+    devices = [*kinect_1473(1, "B"), *kinect_1414(2, "A"), *kinect_1414(3, "C"), *kinect_k4w(4, "D")]
+    cameras = kinect_cameras(devices)
+    motors = [motor_beside(camera, devices) for camera in cameras]
+    assert [motor and motor.port_numbers for motor in motors] == [None, (2, 2), (3, 2), None]
