@@ -233,6 +233,14 @@ def test_the_doctor_finds_nothing_wrong_but_the_hardware(site: Site, source: str
     assert report["passed_but_for_hardware"], said
 
 
+def test_a_running_service_may_ask_how_good_the_clock_is(site: Site) -> None:
+    for name, machine in site.machines.items():
+        for unit in UNITS[name]:
+            allowed = machine.run("systemctl", "show", "--property=SystemCallFilter", unit)
+            assert {"adjtimex", "clock_adjtime"} <= set(allowed.partition("=")[2].split())
+            assert "clock_settime" not in allowed
+
+
 def test_the_journal_says_which_camera_speaks(site: Site) -> None:
     for camera in CAMERAS:
         lines = site.machines["pi"].run("journalctl", "--no-pager", f"KINECT_RIG_CAMERA={camera}")
@@ -254,6 +262,9 @@ def test_a_frame_loop_that_stops_is_ended_and_started_again_by_systemd(site: Sit
 def test_an_upgrade_goes_from_machine_to_machine_and_back_again(site: Site) -> None:
     before = {name: site.release(name) for name in UNITS}
     option = checkout("next", "99.0")
+    preview = site.play("site.yml", "-e", option, "--check", booted=True)
+    assert preview.status == 0, preview.output
+    assert {name: site.release(name) for name in UNITS} == before
     assert site.play("upgrade.yml", "-e", option, "--tags", "install").status == 0
     upgrade = site.play("upgrade.yml", "-e", option, booted=True)
     assert upgrade.status == 0, upgrade.output
