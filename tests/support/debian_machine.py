@@ -54,7 +54,8 @@ class DebianMachine:
 
     def boot(self, network_namespace: str) -> None:
         """Start its systemd as the first process of namespaces of its own; returns when it is up."""
-        words = ["systemd-nspawn", "--quiet", "--register=no", "--keep-unit", "--boot", "--console=pipe"]
+        words = ["setpriv", "--pdeathsig", "KILL"]  # it ends with us, whatever ends us
+        words += ["systemd-nspawn", "--quiet", "--register=no", "--keep-unit", "--boot", "--console=pipe"]
         words += [f"--directory={self.root}", f"--machine={self.name}", "--resolv-conf=off"]
         words += [f"--network-namespace-path=/run/netns/{network_namespace}"]
         self._nspawn = subprocess.Popen(
