@@ -5,7 +5,7 @@ BIN    := $(VENV)/bin
 READY  := $(VENV)/.ready
 BENCH  := $(VENV)/.ready-bench
 
-.PHONY: demo test lint bench bench-codecs bench-transport bench-calibration bench-kinect soak fuzz docs clean
+.PHONY: demo test lint lint-deploy deploy-test bench bench-codecs bench-transport bench-calibration bench-kinect soak fuzz docs clean
 
 demo: $(READY)  ## twelve simulated Kinects over loopback UDP, calibrated and fused into build/demo
 	$(BIN)/rig-server --calibrate --simulate 12 --frames 5 --out build/demo
@@ -18,6 +18,13 @@ lint: $(READY)  ## style, types, import rules
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 	$(BIN)/lint-imports
+
+lint-deploy: $(VENV)/.ready-deploy  ## the Ansible playbooks
+	$(BIN)/yamllint --strict deploy
+	cd deploy/ansible && PATH="$(abspath $(BIN)):$$PATH" ansible-lint --offline
+
+deploy-test: $(VENV)/.ready-deploy  ## a PC and a Pi of Debian roots, deployed, booted, upgraded, rolled back; root, 15 minutes
+	$(BIN)/pytest -m deploy -s tests/deployment
 
 bench-codecs: $(READY)  ## sizes and times of the codecs, into docs/performance.md
 	$(BIN)/python tests/benchmarks/bench_codecs.py

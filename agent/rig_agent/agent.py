@@ -12,7 +12,6 @@ import time
 from collections.abc import Callable
 from dataclasses import fields, replace
 
-from rig_agent import service
 from rig_agent.capture import Capture
 from rig_agent.config import AgentSettings
 from rig_agent.encoder import encode_frame, fits
@@ -22,6 +21,7 @@ from rig_agent.hello import make_hello
 from rig_agent.remote_control import RemoteControl
 from rig_agent.sources.base import FrameSource, SourceDescription
 from rig_agent.transport import now_ns
+from rig_agent.unix_socket import send_to_unix_socket
 from rig_agent.uplink import Uplink, Wanted
 from rig_protocol.agent_session import is_due
 from rig_protocol.errors import RigError
@@ -29,6 +29,7 @@ from rig_protocol.events import ControlRequested
 from rig_protocol.frames import EncodedFrame, RgbdFrame
 from rig_protocol.messages import Hello
 from rig_protocol.rig_key import RigKey
+from rig_protocol.service_manager import ServiceManager
 from rig_protocol.system_clock import SystemClock
 from rig_protocol.troubleshooting import Topic, see
 
@@ -58,6 +59,7 @@ class Agent:
         self._remote = RemoteControl(self._capture, self._wake_up)
         self._encoder = threading.Thread(target=self._encode_frames, name="encoder", daemon=True)
         self._uplink = Uplink(settings, rig_key, SystemClock(now_ns, time.time_ns).read)
+        self._service_manager = ServiceManager(send_to_unix_socket)
         self._hello: Hello | None = None  # of the source that is open now
         self._introduced: Hello | None = None
         self._wanted: Wanted | None = None  # what the encoder encodes for; None: nobody listens
@@ -109,13 +111,13 @@ class Agent:
     def _serve_network(self) -> None:
         time_ns = gauges_due_ns = now_ns()
         health = HealthLog(self._settings.report_interval_s, time_ns)
-        watchdog, hang = service.Watchdog(), _Hang()
-        service.notify("READY=1")
+        hang = _Hang()
+        self._service_manager.notify("READY=1")
         while not self._stopping.is_set():
             self._wait(time_ns)
             time_ns = now_ns()
             self._forward(time_ns)
-            watchdog.feed(time_ns)
+            self._service_manager.feed_watchdog(time_ns)
             if is_due(gauges_due_ns, time_ns, _GAUGES_INTERVAL_NS):
                 gauges_due_ns = time_ns + _GAUGES_INTERVAL_NS
                 self._uplink.report_health(gauges(self.totals))
@@ -161,7 +163,7 @@ class Agent:
 
     def _shut_down(self) -> None:
         self._stopping.set()
-        service.notify("STOPPING=1")
+        self._service_manager.notify("STOPPING=1")
         self._uplink.close(now_ns())
         ended = self._capture.stop(_STOP_TIMEOUT_S)
         if not ended:

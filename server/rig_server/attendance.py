@@ -34,7 +34,7 @@ def absence_message(
     absent = absent_names(settings, connected)
     who = f"{len(absent)} of {len(connected) + len(absent)} cameras have not come: {', '.join(absent)}"
     advice = (
-        "On their machines look at `systemctl status rig-agent`, at `server` in "
+        "On their machines look at `systemctl status 'rig-agent@*'`, at `server` in "
         "`rig-agent --print-config`, and at power and network cables"
     )
     refusals = [f"refused {event.address[0]}: {event.text}" for event in refused]

@@ -76,6 +76,7 @@ class RigStatus:
     start, by the names in `rig_server.durations`; `recent`: the same of the last half minute. `link`: what is
     sent and what that takes, in words. `drift`: what the drift watch says, None where nobody watches.
     `unassigned`: agents that hold the key and have no slot.
+    `turns`: rises while the receiver is alive, at least once a second.
     """
 
     cameras: tuple[CameraMetrics, ...]
@@ -95,6 +96,7 @@ class RigStatus:
     drift: DriftReport | None = None
     authenticated: bool = False
     unassigned: tuple[UnassignedAgent, ...] = ()
+    turns: int = 0
 
     @property
     def connected(self) -> int:

@@ -33,6 +33,8 @@ _RECEIVES_A_TURN = 64  # before the link's own time-outs get their turn: 4 MB of
 # Twelve agents send some 6600 bursts a second. Waking up for each costs more than taking them; a thousand
 # wake-ups a second take several at a time, and a set is a millisecond later at most.
 _TURN_S = 0.001
+# Also where nothing comes and nothing is due the receiver turns, to show that it is alive.
+_LONGEST_SLEEP_NS = 1_000_000_000
 
 
 def rig_time_ns() -> int:
@@ -94,6 +96,7 @@ class Receiver:
         self.receive_buffer_bytes = ask_for_receive_buffer(self._socket, receive_buffer_bytes)
         self.merges = use_gro and switch_on(self._socket, socket.IPPROTO_UDP, _UDP_GRO)
         self.counts_drops = switch_on(self._socket, socket.SOL_SOCKET, _SO_RXQ_OVFL)
+        self.turns = 0  # rises while the receiver is alive
         self.kernel_drops = 0  # datagrams that found the socket's buffer full
         self.unsent = 0  # control datagrams that the network refused
         self.failure: Exception | None = None
@@ -153,15 +156,17 @@ class Receiver:
                     time.sleep(_TURN_S)
                 emptied = self._receive_some()
                 self._serve_link()
+                self.turns += 1
             self._link.close(rig_time_ns())
             self._transmit()
         except Exception as error:  # whatever ends this thread must reach the program
             logger.exception("the receiver stopped")
             self.failure = error
 
-    def _timeout_ms(self) -> float | None:
-        due_ns = self._link.next_timeout_ns()
-        return None if due_ns is None else max(0.0, (due_ns - rig_time_ns()) / 1e6)
+    def _timeout_ms(self) -> float:
+        due_ns, now_ns = self._link.next_timeout_ns(), rig_time_ns()
+        sleep_ns = _LONGEST_SLEEP_NS if due_ns is None else min(due_ns - now_ns, _LONGEST_SLEEP_NS)
+        return max(0.0, sleep_ns / 1e6)
 
     def _receive_some(self) -> bool:
         """Take what waits, but not for ever; True when nothing waits any more."""

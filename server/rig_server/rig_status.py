@@ -48,6 +48,7 @@ class StatusReader:
         )
         return RigStatus(
             authenticated=self._link.authenticated,
+            turns=self._receiver.turns,
             cameras=self._cameras(hellos, now_ns),
             complete=assembler.complete,
             partial=assembler.partial,

@@ -46,7 +46,7 @@ def _python() -> Finding:
         return failed(
             Check.PYTHON,
             f"{said}: {', '.join(missing)} not installed",
-            "sudo /opt/kinect-rig/bin/pip install 'kinect-rig[agent]'",
+            "sudo /opt/kinect-rig/current/bin/pip install 'kinect-rig[agent]'",
             Topic.MISSING_LIBRARY,
         )
     return ok(Check.PYTHON, f"{said}, all {len(names)} packages")
@@ -85,7 +85,7 @@ def _libfreenect(machine: Machine, settings: AgentSettings) -> Finding:
 
 def _openni2(machine: Machine, settings: AgentSettings) -> Finding:
     if not _is_installed("openni"):
-        mend = "sudo /opt/kinect-rig/bin/pip install 'kinect-rig[openni]'"
+        mend = "sudo /opt/kinect-rig/current/bin/pip install 'kinect-rig[openni]'"
         return failed(
             Check.OPENNI2, "the Python package openni is not installed", mend, Topic.MISSING_LIBRARY
         )

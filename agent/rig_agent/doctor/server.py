@@ -31,7 +31,7 @@ _NO_DEVICE = SourceDescription(None, None, CameraModel(), 30.0, "bayer", "raw")
 _OF_ANONYMOUS = {RejectReason.DUPLICATE_SLOT, RejectReason.UNKNOWN_CAMERA}
 _MENDS = {
     RejectReason.WRONG_KEY: f"sudo install -m 600 -o kinect-rig rig.key {KEY_PLACES[-1]}",
-    RejectReason.VERSION_MISMATCH: "sudo /opt/kinect-rig/bin/pip install --upgrade 'kinect-rig[agent]'",
+    RejectReason.VERSION_MISMATCH: "ansible-playbook -i rig.inventory upgrade.yml",
     RejectReason.NO_ROOM: "rig-server budget",
 }
 

@@ -29,7 +29,7 @@ def usb(machine: Machine, settings: AgentSettings) -> list[Finding]:
     except SourceLost as error:
         return [_absent(devices, cameras, error)]
     except ConfigurationError as error:
-        mend = "sudoedit /etc/kinect-rig/agent.toml"
+        mend = "sudoedit /etc/kinect-rig/cam*.toml"
         return [failed(Check.KINECT, str(error), mend, error.topic), *_controllers(cameras)]
     beside = [device for device in devices if _hub(device) == _hub(camera.device)]
     return [
@@ -105,7 +105,7 @@ def _permission(machine: Machine, camera: KinectCamera, beside: Sequence[UsbDevi
             case Topic.KINECT_IN_USE if machine.runs("rig-agent"):
                 return ok(Check.PERMISSION, "the rig-agent that runs here has the camera")
             case Topic.KINECT_IN_USE:
-                mend = "sudo systemctl stop rig-agent && sudo rmmod gspca_kinect"
+                mend = "sudo systemctl stop 'rig-agent@*' && sudo rmmod gspca_kinect"
             case Topic.NO_PERMISSION:
                 mend = _REPLUG_RULES
             case _:

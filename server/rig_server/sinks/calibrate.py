@@ -41,8 +41,8 @@ class CalibrateSink:
         """The sets to calibrate on, and a warning where partial ones had to do; RigError for none at all."""
         if not (self._complete or self._partial):
             raise RigError(
-                "the cameras are connected but no frame has arrived: look at `journalctl -u rig-agent` on "
-                "their machines",
+                "the cameras are connected but no frame has arrived: look at `journalctl -u 'rig-agent@*'` "
+                "on their machines",
                 Topic.NO_FRAMES,
             )
         spare = self._partial[: self._count - len(self._complete)]

@@ -1,11 +1,10 @@
-"""Rules of health: rates are of the time since the last line, gauges follow the machine, systemd is told."""
+"""Rules of health: rates are of the time since the last line, gauges follow the machine."""
 
-import socket
 from pathlib import Path
 
 import pytest
 
-from rig_agent import health, service
+from rig_agent import health
 from rig_agent.health import HealthLog, Totals, gauges
 
 SECOND_NS = 1_000_000_000
@@ -45,25 +44,3 @@ def test_the_temperature_is_told_where_the_machine_knows_it(
     monkeypatch.setattr(health, "_PROCESSOR_TEMPERATURE", file)
     assert gauges(Totals(dropped=3)).get("temperature_c") == found
     assert gauges(Totals(dropped=3))["dropped"] == 3
-
-
-def test_systemd_is_told_when_it_listens(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as manager:
-        manager.bind(str(tmp_path / "notify"))
-        manager.settimeout(5)
-        monkeypatch.setenv("NOTIFY_SOCKET", str(tmp_path / "notify"))
-        monkeypatch.setenv("WATCHDOG_USEC", "2000000")
-        service.notify("READY=1")
-        watchdog = service.Watchdog()
-        for tenth in range(25):
-            watchdog.feed(5 * SECOND_NS + tenth * SECOND_NS // 10)
-        assert [manager.recv(100) for _ in range(4)] == [b"READY=1", *[b"WATCHDOG=1"] * 3]
-
-
-def test_without_systemd_nothing_is_said(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
-    monkeypatch.delenv("NOTIFY_SOCKET", raising=False)
-    monkeypatch.delenv("WATCHDOG_USEC", raising=False)
-    service.notify("READY=1")
-    service.Watchdog().feed(1)
-    monkeypatch.setenv("NOTIFY_SOCKET", str(tmp_path / "gone"))
-    service.notify("READY=1")

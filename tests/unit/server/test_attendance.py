@@ -38,4 +38,4 @@ def test_the_message_names_the_absent_what_was_refused_and_what_to_look_at() -> 
     message = absence_message(LISTED, {0}, [refused])
     assert "2 of 3 cameras have not come: door, cam05" in message
     assert "refused 10.0.0.17: speaks version 9" in message
-    assert "systemctl status rig-agent" in message
+    assert "systemctl status 'rig-agent@*'" in message

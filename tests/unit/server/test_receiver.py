@@ -134,6 +134,19 @@ def test_answers_of_the_link_go_back_to_the_sender(sender: socket.socket) -> Non
         rigged.receiver.stop()
 
 
+def test_a_receiver_to_which_nothing_comes_turns_all_the_same() -> None:
+    """systemd's watchdog is fed by its turns: a rig whose cameras are all switched off is no failure."""
+    turned: queue.Queue[int] = queue.Queue()
+    receiver = Receiver(EchoLink(), LOOPBACK, lambda _event: None, 65_536, on_turn=turned.put)
+    receiver.start()
+    try:
+        turned.get(timeout=10)
+        turned.get(timeout=10)
+        assert receiver.turns >= 1
+    finally:
+        receiver.stop()
+
+
 def test_an_empty_datagram_reaches_the_link_which_counts_it(sender: socket.socket) -> None:
     rigged = Rigged(EchoLink())
     try:
