@@ -5,7 +5,7 @@ BIN    := $(VENV)/bin
 READY  := $(VENV)/.ready
 BENCH  := $(VENV)/.ready-bench
 
-.PHONY: demo test lint lint-deploy deploy-test bench bench-codecs bench-transport bench-calibration soak fuzz docs clean
+.PHONY: demo test lint lint-deploy deploy-test arm64-test bench bench-codecs bench-transport bench-calibration soak fuzz docs clean
 
 demo: $(READY)  ## twelve simulated Kinects over loopback UDP, calibrated and fused into build/demo
 	$(BIN)/rig-server --calibrate --simulate 12 --frames 5 --out build/demo
@@ -25,6 +25,9 @@ lint-deploy: $(VENV)/.ready-deploy  ## the Ansible playbooks
 
 deploy-test: $(VENV)/.ready-deploy  ## a PC and a Pi of Debian roots, deployed, booted, upgraded, rolled back; root, 15 minutes
 	$(BIN)/pytest -m deploy -s tests/deployment
+
+arm64-test: $(READY)  ## the agent in an emulated arm64 Debian, to a server here; root, 5 minutes
+	$(BIN)/pytest -m arm64 -s tests/arm64
 
 bench-codecs: $(READY)  ## sizes and times of the codecs, into docs/performance.md
 	$(BIN)/python tests/benchmarks/bench_codecs.py
