@@ -34,7 +34,7 @@ def agent_requirements() -> list[str]:
 
 
 def resolve() -> list[str]:
-    """File names of what pip would install on a Pi; nothing is kept. AssertionError: no set of wheels fits."""
+    """File names of what pip would install on a Pi; nothing is kept. AssertionError: no wheels fit."""
     with tempfile.TemporaryDirectory() as folder:
         report = Path(folder, "report.json")
         _pip("install", "--dry-run", "--ignore-installed", "--report", report, "--target", folder)
