@@ -28,7 +28,15 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 from transport_chaos import CAMERAS, FPS, ServerProcess
 
 from support.benchmark_record import REPOSITORY, machine, markdown_table, merge_results, write_section
-from support.kill_recovery import ALLOWED_S, DeliveredSet, Kill, complete_since, unexplained, whole_since
+from support.kill_recovery import (
+    ALLOWED_S,
+    DeliveredSet,
+    Kill,
+    camera_since,
+    complete_since,
+    unexplained,
+    whole_since,
+)
 from support.rig_processes import AgentProcess, free_port, write_small_rig
 
 GAP_S = (2.0, 8.0)  # between kills
@@ -184,6 +192,7 @@ def _times(some: Sequence[Kill], kills: Sequence[Kill], sets: Sequence[Delivered
     """Kills, recoveries, and the times of the latter."""
     whole = [(kill, time_s) for kill in some if (time_s := whole_since(kill, kills, sets)) is not None]
     complete = [time_s - kill.ready_s for kill in some if (time_s := complete_since(kill, sets)) is not None]
+    camera = [time_s - kill.ready_s for kill in some if (time_s := camera_since(kill, sets)) is not None]
     from_restart_s = [time_s - kill.restart_s for kill, time_s in whole]
     # The camera may be in the sets before the service manager's process gets to hear of it.
     from_ready_s = [max(0.0, time_s - kill.ready_s) for kill, time_s in whole]
@@ -195,6 +204,7 @@ def _times(some: Sequence[Kill], kills: Sequence[Kill], sets: Sequence[Delivered
         "from_kill_s": _summary([time_s - kill.kill_s for kill, time_s in whole]),
         "from_restart_s": _summary(from_restart_s),
         "from_ready_s": _summary(from_ready_s),
+        "camera_from_ready_s": _summary(camera),
         "complete_from_ready_s": _summary(complete),
     }
 
@@ -212,6 +222,10 @@ def page(result: dict[str, Any]) -> str:
         ["from the kill", *(_pair(one["from_kill_s"]) for one in columns)],
         ["from the start of the new process", *(_counted(one, "restart") for one in columns)],
         ["from its word that it is ready", *(_counted(one, "ready") for one in columns)],
+        [
+            "its own camera in the sets, from that word",
+            *(_pair(one["camera_from_ready_s"]) for one in columns),
+        ],
         ["all twelve in a set, from that word", *(_pair(one["complete_from_ready_s"]) for one in columns)],
     ]
     return _PAGE.format(

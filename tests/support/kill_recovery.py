@@ -1,6 +1,6 @@
 """When a rig is whole again after its agents were killed, from what its server delivered."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from collections.abc import Set as AbstractSet
 from dataclasses import dataclass
 
@@ -37,15 +37,12 @@ def whole_since(kill: Kill, kills: Sequence[Kill], sets: Sequence[DeliveredSet])
 
     They lack at most cameras whose agents another kill keeps away, no longer than is allowed.
     """
-    run: list[float] = []
-    for one in sets:
-        if one.time_s < kill.restart_s:
-            continue
-        excused = _excused(kills, one) - {kill.camera}
-        run = [*run, one.time_s] if one.missing <= excused else []
-        if len(run) == _IN_A_ROW:
-            return run[0]
-    return None
+    return _first_in_a_row(kill, sets, lambda one: one.missing <= _excused(kills, one) - {kill.camera})
+
+
+def camera_since(kill: Kill, sets: Sequence[DeliveredSet]) -> float | None:
+    """When the first of some sets in a row came that hold the camera, whatever else they lack."""
+    return _first_in_a_row(kill, sets, lambda one: kill.camera not in one.missing)
 
 
 def complete_since(kill: Kill, sets: Sequence[DeliveredSet]) -> float | None:
@@ -56,6 +53,18 @@ def complete_since(kill: Kill, sets: Sequence[DeliveredSet]) -> float | None:
 def unexplained(kills: Sequence[Kill], sets: Sequence[DeliveredSet]) -> list[DeliveredSet]:
     """Sets that lack a camera which no kill excuses."""
     return [one for one in sets if not one.missing <= _excused(kills, one)]
+
+
+def _first_in_a_row(
+    kill: Kill, sets: Sequence[DeliveredSet], fits: Callable[[DeliveredSet], bool]
+) -> float | None:
+    run: list[float] = []
+    for one in sets:
+        if one.time_s >= kill.restart_s:
+            run = [*run, one.time_s] if fits(one) else []
+        if len(run) == _IN_A_ROW:
+            return run[0]
+    return None
 
 
 def _excused(kills: Sequence[Kill], one: DeliveredSet) -> set[int]:

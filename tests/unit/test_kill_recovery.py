@@ -1,6 +1,6 @@
 """The soak's verdict on recovery is a measuring instrument: what it must not overlook, and must not blame."""
 
-from support.kill_recovery import DeliveredSet, Kill, complete_since, unexplained, whole_since
+from support.kill_recovery import DeliveredSet, Kill, camera_since, complete_since, unexplained, whole_since
 
 KILL = Kill(camera=3, signal="SIGKILL", kill_s=10.0, restart_s=12.0, ready_s=12.5)
 
@@ -33,7 +33,8 @@ def test_a_camera_that_another_kill_keeps_away_is_not_blamed_but_no_set_without_
 
 
 def test_a_camera_away_without_a_reason_or_for_too_long_is_told() -> None:
-    assert whole_since(KILL, [KILL], sets({7: 40.0})) is None
+    assert whole_since(KILL, [KILL], sets({3: 13.0, 7: 40.0})) is None
+    assert camera_since(KILL, sets({3: 13.0, 7: 40.0})) == 13.0
     assert len(unexplained([KILL], sets({7: 11.05}))) == 11
     assert not unexplained([KILL], sets({3: 17.45}))
     assert len(unexplained([KILL], sets({3: 17.75}))) == 2
