@@ -5,7 +5,8 @@ BIN    := $(VENV)/bin
 READY  := $(VENV)/.ready
 BENCH  := $(VENV)/.ready-bench
 
-.PHONY: demo test lint lint-deploy deploy-test bench bench-codecs bench-transport bench-calibration bench-kinect soak fuzz docs clean
+.PHONY: demo test lint lint-deploy deploy-test arm64-test bench bench-codecs bench-transport bench-calibration bench-kinect soak \
+	soak-agents fuzz docs clean
 
 demo: $(READY)  ## twelve simulated Kinects over loopback UDP, calibrated and fused into build/demo
 	$(BIN)/rig-server --calibrate --simulate 12 --frames 5 --out build/demo
@@ -26,11 +27,17 @@ lint-deploy: $(VENV)/.ready-deploy  ## the Ansible playbooks
 deploy-test: $(VENV)/.ready-deploy  ## a PC and a Pi of Debian roots, deployed, booted, upgraded, rolled back; root, 15 minutes
 	$(BIN)/pytest -m deploy -s tests/deployment
 
+arm64-test: $(READY)  ## the agent in an emulated arm64 Debian, to a server here; root, 5 minutes
+	$(BIN)/pytest -m arm64 -s tests/arm64
+
 bench-codecs: $(READY)  ## sizes and times of the codecs, into docs/performance.md
 	$(BIN)/python tests/benchmarks/bench_codecs.py
 
 soak: $(READY)  ## ten minutes of killed programs, pulled cables, clock steps and floods: SOAK_MINUTES=10
 	$(BIN)/python tests/benchmarks/transport_chaos.py --soak $(or $(SOAK_MINUTES),10)
+
+soak-agents: $(READY)  ## agents killed every few seconds, for ten minutes, into docs/performance.md: SOAK_MINUTES=10
+	$(BIN)/python tests/benchmarks/agent_soak.py $(or $(SOAK_MINUTES),10)
 
 fuzz: $(VENV)/.ready-fuzz  ## every parser of strangers' bytes, 100 s each: FUZZ_SECONDS=100
 	for target in server_link agent_link bodies units codecs key_files; do \

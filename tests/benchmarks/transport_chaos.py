@@ -25,6 +25,7 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from rig_protocol.datagram import FRAGMENT_PREFIX, VERSION, MessageType
 from rig_protocol.testing import Faults
+from support.kill_recovery import DeliveredSet
 from support.rig_processes import LOOPBACK, AgentProcess, free_port, server_settings, write_small_rig
 from support.udp_relay import UdpRelay
 
@@ -44,7 +45,7 @@ class ServerProcess:
         self._settings.write_text(server_settings(port, CAMERAS).model_dump_json())
         self._log = (folder / "server.log").open("ab")
         self._changed = threading.Condition()
-        self._sets: list[tuple[float, int]] = []  # when, and how many cameras it lacks
+        self._sets: list[DeliveredSet] = []
         self.status: dict[str, Any] = {}
         self.start()
 
@@ -79,16 +80,20 @@ class ServerProcess:
             raise SystemExit(f"no whole sets within {PATIENCE_S:.0f} s; often missing: {missing}")
         return steady_s
 
+    def sets_since(self, start_s: float) -> list[DeliveredSet]:
+        """What was delivered, in order."""
+        with self._changed:
+            return [one for one in self._sets if one.time_s >= start_s]
+
     def incomplete_since(self, start_s: float) -> int:
         """Sets that lacked a camera."""
-        with self._changed:
-            return sum(1 for time_s, missing in self._sets if time_s >= start_s and missing)
+        return sum(1 for one in self.sets_since(start_s) if one.missing)
 
     def _steady(self, start_s: float) -> float | None:
         run: list[float] = []
-        for time_s, missing in self._sets:
-            if time_s >= start_s:
-                run = [] if missing else [*run, time_s]
+        for one in self._sets:
+            if one.time_s >= start_s:
+                run = [] if one.missing else [*run, one.time_s]
                 if len(run) == STEADY_SETS:
                     return run[0]
         return None
@@ -98,7 +103,7 @@ class ServerProcess:
             told = json.loads(line)
             with self._changed:
                 if "missing" in told:
-                    self._sets.append((told["t"], len(told["missing"])))
+                    self._sets.append(DeliveredSet(told["t"], frozenset(told["missing"])))
                 elif "status" in told:
                     self.status = {**told["status"], "resident_kib": told["resident_kib"]}
                 self._changed.notify_all()

@@ -25,7 +25,7 @@ def make_base(root: Path) -> None:
     if done.exists():
         return
     shutil.rmtree(root, ignore_errors=True)
-    _run(["debootstrap", "--variant=minbase", f"--include={_PACKAGES}", SUITE, str(root), *_mirror()])
+    _run(["debootstrap", "--variant=minbase", f"--include={_PACKAGES}", SUITE, str(root), *mirror()])
     acquire = _run(["apt-config", "dump", "Acquire"])
     (root / "etc/apt/apt.conf.d/90host").write_text(acquire)
     _copy_pip_settings(root)
@@ -98,7 +98,7 @@ def write_enter(path: Path) -> Path:
     return path
 
 
-def _mirror() -> list[str]:
+def mirror() -> list[str]:
     """Where this machine's apt finds the suite; nothing: debootstrap's own default."""
     listed = _run(["apt-get", "indextargets", "--format", "$(CREATED_BY) $(RELEASE) $(SITE)"])
     sites = [line.split() for line in listed.splitlines()]

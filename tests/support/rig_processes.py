@@ -51,6 +51,7 @@ class AgentProcess:
         *,
         host: str = LOOPBACK,
         prefix: Sequence[str] = (),
+        program: Sequence[str] = (sys.executable, "-m", "rig_agent.cli"),
         stepping: bool = False,
     ) -> None:
         """`host` is the server's; `prefix` runs the agent elsewhere: ip netns exec NAME.
@@ -58,9 +59,10 @@ class AgentProcess:
         `stepping`: SIGUSR1 and SIGUSR2 make its clock jump (support/stepping_clock.py).
         """
         self._log, self._env = log, env
-        program = [str(_STEPPING_CLOCK), "rig_agent.cli"] if stepping else ["-m", "rig_agent.cli"]
+        if stepping:
+            program = [sys.executable, str(_STEPPING_CLOCK), "rig_agent.cli"]
         self._words = [
-            *(*prefix, sys.executable, *program, "--server", f"{host}:{port}"),
+            *(*prefix, *program, "--server", f"{host}:{port}"),
             *("--key-file", str(rig_key_file())),
             *map(str, options),
         ]
@@ -79,6 +81,11 @@ class AgentProcess:
         assert self._process is not None
         self._process.kill()
         self._process.wait()
+
+    def wait(self) -> int:
+        """Until it ends; the exit status."""
+        assert self._process is not None
+        return self._process.wait()
 
     def send_signal(self, number: int) -> None:
         """Any signal."""

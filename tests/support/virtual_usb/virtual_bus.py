@@ -181,16 +181,24 @@ def enter(bus: VirtualBus, monkeypatch: pytest.MonkeyPatch) -> None:
 @functools.cache
 def library() -> Path:
     """The compiled stand-in for libusb, built once for these sources; skips when it cannot be built."""
-    include = next((path for path in _HEADERS if Path(path, "libusb.h").exists()), None)
     # Found, not loaded: loading libfreenect here would load the real libusb.
-    if include is None or shutil.which("gcc") is None or ctypes.util.find_library("freenect") is None:
-        pytest.skip(f"virtual Kinects need gcc, the libusb header and libfreenect: {_INSTALL}")
+    if ctypes.util.find_library("freenect") is None:
+        pytest.skip(f"virtual Kinects need libfreenect: {_INSTALL}")
+    return compiled("gcc")
+
+
+def compiled(compiler: str) -> Path:
+    """The stand-in as this compiler makes it, for whichever machine; skips when it cannot be built."""
+    include = next((path for path in _HEADERS if Path(path, "libusb.h").exists()), None)
+    if include is None or shutil.which(compiler) is None:
+        pytest.skip(f"virtual Kinects need {compiler} and the libusb header: {_INSTALL}")
     sources = sorted(_SOURCES.glob("*.[ch]"))
     digest = hashlib.sha256(b"".join(path.read_bytes() for path in sources)).hexdigest()[:16]
-    built = Path(tempfile.gettempdir()) / f"kinect-rig-virtual-usb-{os.getuid()}-{digest}" / _SONAME
+    folder = f"kinect-rig-virtual-usb-{os.getuid()}-{compiler}-{digest}"
+    built = Path(tempfile.gettempdir()) / folder / _SONAME
     if not built.exists():
         built.parent.mkdir(mode=0o700, exist_ok=True)
-        _compile([path for path in sources if path.suffix == ".c"], include, built)
+        _compile(compiler, [path for path in sources if path.suffix == ".c"], include, built)
     return built
 
 
@@ -200,7 +208,7 @@ def pack_bits(values: npt.NDArray[np.uint16], bits: int) -> bytes:
     return np.packbits(unpacked[:, 16 - bits :]).tobytes()
 
 
-def _compile(sources: list[Path], include: str, target: Path) -> None:
+def _compile(compiler: str, sources: list[Path], include: str, target: Path) -> None:
     scratch = target.with_suffix(f".{os.getpid()}")  # test workers may compile at the same time
     options = [
         "-O2",
@@ -213,7 +221,7 @@ def _compile(sources: list[Path], include: str, target: Path) -> None:
         f"-Wl,-soname,{_SONAME}",
     ]
     subprocess.run(
-        ["gcc", *options, f"-I{include}", *map(str, sources), "-o", str(scratch), "-lpthread"], check=True
+        [compiler, *options, f"-I{include}", *map(str, sources), "-o", str(scratch), "-lpthread"], check=True
     )
     scratch.rename(target)
 
