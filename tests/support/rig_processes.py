@@ -82,11 +82,6 @@ class AgentProcess:
         self._process.kill()
         self._process.wait()
 
-    def wait(self) -> int:
-        """Until it ends; the exit status."""
-        assert self._process is not None
-        return self._process.wait()
-
     def send_signal(self, number: int) -> None:
         """Any signal."""
         assert self._process is not None
