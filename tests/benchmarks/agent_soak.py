@@ -96,7 +96,7 @@ class SupervisedAgent:
 
     def _restart(self) -> None:
         while True:
-            self._agent.wait()
+            self._agent.wait(None)  # however long it lives
             self._ending.wait(self._restart_after_s)
             with self._starting:
                 if self._ending.is_set():

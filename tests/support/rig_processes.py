@@ -97,8 +97,8 @@ class AgentProcess:
             self.kill()
             raise
 
-    def wait(self, timeout_s: float = START_TIMEOUT_S) -> int:
-        """Until it ends by itself; the exit status."""
+    def wait(self, timeout_s: float | None = START_TIMEOUT_S) -> int:
+        """Until it ends by itself, None: however long that takes; the exit status."""
         assert self._process is not None
         return self._process.wait(timeout_s)
 
