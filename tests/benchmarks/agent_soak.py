@@ -50,7 +50,8 @@ _PAGE = """## Agents killed at random
 {load_max:.1f} at most. Twelve real `rig-agent` processes at {fps:.0f} frames/s and a real server process.
 For {minutes:.1f} minutes one of the agents is killed every {gap_s[0]:.0f} to {gap_s[1]:.0f} s, {kills} times,
 and started again after {restart_after_s:.0f} s, as by systemd; by themselves they ended
-{by_themselves} times.
+{by_themselves} times. All share this machine's cores with whatever else makes the load: how soon a new
+process is ready shows little else.
 Sets are whole with the first of ten in a row that lack at most cameras which another kill took away;
 a set of all twelve waits for those, too.
 
