@@ -40,7 +40,7 @@ def announced(address: Address, interfaces: Sequence[str] | None = None) -> Iter
     name = platform.node().partition(".")[0] or "rig-server"
     service = ServiceInfo(
         SERVICE_TYPE,
-        f"{name}.{SERVICE_TYPE}",
+        f"{name}-{port}.{SERVICE_TYPE}",  # two servers of one machine are told apart at once
         parsed_addresses=_reachable(host) if interfaces is None else list(interfaces),
         port=port,
         properties={"protocol": str(VERSION)},
