@@ -139,16 +139,35 @@ def test_what_a_kinect_cannot_do_is_refused_in_words_and_harms_nothing(
 
 @pytest.mark.parametrize("model", ["1473", "K4W"])
 @pytest.mark.parametrize(("name", "value"), [("led", "red"), ("tilt_deg", 3)])
-def test_models_without_a_motor_device_refuse_led_and_tilt(
+def test_later_models_without_firmware_refuse_led_and_tilt_and_send_images(
     usb_bus: VirtualBus, model: str, name: str, value: float | str
 ) -> None:
     usb_bus.add_kinect("A00364A11111111A")
+    kinect = usb_bus.add_kinect("B50123456789012B", model=model.lower(), plugged=False)
+    kinect.write("no_firmware")
+    kinect.plug()
+    with FreenectSource(FreenectSettings(serial=kinect.serial)) as source:
+        with pytest.raises(ControlRefused, match="want firmware"):
+            source.control(name, value)
+        assert next_frame(source).gravity is None
+
+
+@pytest.mark.parametrize("model", ["1473", "K4W"])
+def test_later_models_with_firmware_are_told_by_their_own_audio_device(
+    usb_bus: VirtualBus, model: str
+) -> None:
+    others = [usb_bus.add_kinect("A00364A11111111A"), usb_bus.add_kinect("B50111111111111B", model="1473")]
     kinect = usb_bus.add_kinect("B50123456789012B", model=model.lower())
-    with (
-        FreenectSource(FreenectSettings(serial=kinect.serial)) as source,
-        pytest.raises(ControlRefused, match="only model 1414"),
-    ):
-        source.control(name, value)
+    with FreenectSource(FreenectSettings(serial=kinect.serial)) as source:
+        assert source.control("led", "red") == "the LED is red"
+        assert source.control("led", "blink_red_yellow").endswith(f"nearest that a {model} has")
+        assert source.control("tilt_deg", -7.4) == "the Kinect turns to -7 degrees above the horizon"
+        next_frame(source)
+    told = [line for line in kinect.log() if line.startswith("audio ")]
+    green, red, blink_green, off = (f"audio led {code}" for code in (3, 4, 2, 1))
+    by_libfreenect = [green]  # at every opening
+    assert told == [*by_libfreenect, green, red, blink_green, "audio tilt -7", off]
+    assert not [line for other in others for line in other.log() if "tilt" in line or "led" in line]
 
 
 def test_near_mode_is_switched_on_a_k4w(usb_bus: VirtualBus) -> None:

@@ -150,16 +150,21 @@ def test_frames_tell_which_way_is_down_by_the_kinects_own_accelerometer(usb_bus:
 
 
 @pytest.mark.parametrize("model", ["1473", "K4W"])
-def test_a_kinect_without_a_motor_of_its_own_streams_and_feels_nothing(
+def test_later_models_feel_by_their_audio_device_once_firmware_runs_in_it(
     usb_bus: VirtualBus, model: str
 ) -> None:
-    usb_bus.add_kinect("B50123456789012B", model=model.lower())
+    kinect = usb_bus.add_kinect("B50123456789012B", model=model.lower())
+    kinect.write("accel", "0 800 -180 0 0")
     with FreenectSource(FreenectSettings()) as source:
-        assert all(frame.gravity is None for frame in frames_of(source, seconds=1.0))
+        gravity = wait_for_gravity(source)
+    assert gravity is not None
+    np.testing.assert_allclose(gravity.down, (0, 0.976, 0.220), atol=0.001)
+    assert kinect.open_handles() == 0
 
 
-def test_a_motor_that_never_answers_costs_no_frame(usb_bus: VirtualBus) -> None:
-    usb_bus.add_kinect("A00364A11111111A").write("mute_motor")
+@pytest.mark.parametrize("model", ["1414", "1473", "K4W"])
+def test_a_motor_that_never_answers_costs_no_frame(usb_bus: VirtualBus, model: str) -> None:
+    usb_bus.add_kinect("A00364A11111111A", model=model.lower()).write("mute_motor")
     with FreenectSource(FreenectSettings()) as source:
         frames = frames_of(source, seconds=1.5)
         counters = source.counters

@@ -39,7 +39,9 @@ _FILES = {
 }
 
 
-def device(product: int, ports: tuple[int, ...], revision: int = 0x010B, bus: int = 1) -> Any:
+def device(
+    product: int, ports: tuple[int, ...], revision: int = 0x010B, bus: int = 1, interfaces: int = 1
+) -> Any:
     """A device as pyusb describes it; it has no serial number."""
     return SimpleNamespace(
         idProduct=product,
@@ -49,6 +51,7 @@ def device(product: int, ports: tuple[int, ...], revision: int = 0x010B, bus: in
         port_numbers=ports,
         iSerialNumber=0,
         speed=HIGH_SPEED,
+        configurations=lambda: (SimpleNamespace(bNumInterfaces=interfaces),),
     )
 
 

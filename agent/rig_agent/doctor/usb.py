@@ -17,6 +17,10 @@ _HIGH_SPEED = 3  # of libusb's enum; 480 Mbit/s
 _REPLUG_RULES = "sudo udevadm control --reload && sudo udevadm trigger"
 _FIRMWARE = "audios.bin"
 _FIRMWARE_FOLDERS = ("/usr/local/share/libfreenect", "/usr/share/libfreenect")  # as libfreenect looks
+_LOAD_FIRMWARE = (
+    "sudo apt install libfreenect-bin && sudo systemctl stop 'rig-agent@*' && cd /tmp && "
+    "sudo timeout 20 freenect-wavrecord"
+)
 
 
 def usb(machine: Machine, settings: AgentSettings) -> list[Finding]:
@@ -39,7 +43,7 @@ def usb(machine: Machine, settings: AgentSettings) -> list[Finding]:
         *_controllers(cameras),
         _permission(machine, camera, beside),
         *_autosuspend(machine, camera),
-        *_firmware(machine, camera),
+        *_firmware(machine, camera, beside),
     ]
 
 
@@ -138,25 +142,26 @@ def _autosuspend(machine: Machine, camera: KinectCamera) -> list[Finding]:
     return [warning(Check.AUTOSUSPEND, text, f"echo on | sudo tee {control}", Topic.NO_FRAMES)]
 
 
-def _firmware(machine: Machine, camera: KinectCamera) -> list[Finding]:
+def _firmware(machine: Machine, camera: KinectCamera, beside: Sequence[UsbDevice]) -> list[Finding]:
     """Models 1473 and K4W have LED, tilt and accelerometer behind an audio device that wants firmware."""
     if camera.model == "1414":
         return []
+    if any(device.idProduct in usb_bus.AUDIO and usb_bus.firmware_runs(device) for device in beside):
+        return [
+            ok(Check.FIRMWARE, f"firmware runs in the audio device: this {camera.model} has LED and tilt")
+        ]
     places = [machine.path(f"{folder}/{_FIRMWARE}") for folder in _FIRMWARE_FOLDERS]
     if own := os.environ.get("LIBFREENECT_FIRMWARE_PATH"):
-        places.insert(0, Path(own))
+        places.insert(0, Path(own, _FIRMWARE))
     found = next((place for place in places if place.is_file()), None)
     if found is not None:
-        return [ok(Check.FIRMWARE, f"the audio firmware is {found}")]
-    return [
-        Finding(
-            Check.FIRMWARE,
-            Status.SKIPPED,
-            f"no audio firmware: images need none, LED, tilt and accelerometer of a {camera.model} do "
-            "(fwfetcher.py comes with libfreenect's source)",
-            "python3 fwfetcher.py audios.bin && sudo install -Dt /usr/share/libfreenect audios.bin",
-        )
-    ]
+        text = f"{found} is not loaded (again after each power-on): images need none"
+        mend = _LOAD_FIRMWARE
+    else:
+        text = "no audio firmware: images need none (where to get it: docs/control.md, Firmware)"
+        mend = f"sudo install -Dt /usr/share/libfreenect audios.bin && {_LOAD_FIRMWARE}"
+    text += f"; LED, tilt and accelerometer of a {camera.model} do"
+    return [Finding(Check.FIRMWARE, Status.SKIPPED, text, mend)]
 
 
 def _hub(device: UsbDevice) -> tuple[int, ...]:

@@ -87,7 +87,7 @@ class SimulatorSettings(Settings):
     """Spread of the cameras' exposures, natural logarithm."""
 
     accelerometers: bool = True
-    """Whether the units feel which way is down, as model 1414 does."""
+    """Whether the units feel which way is down, as a Kinect does."""
     accelerometer_deg: float = Field(1.5, ge=0, le=15)
     """By how much a unit errs about that, one sigma an axis, the same all the time."""
 

@@ -31,7 +31,7 @@ from rig_agent.sources.freenect_thread import FreenectThread
 from rig_agent.sources.libfreenect import load_libfreenect
 from rig_agent.usb import enumerate as usb_bus
 from rig_agent.usb.accelerometer import Accelerometer
-from rig_agent.usb.motor import Led, Motor
+from rig_agent.usb.motor import Led, Motor, NoMotor
 from rig_protocol.errors import RigError
 from rig_protocol.frames import RgbdFrame
 from rig_protocol.settings import Settings
@@ -96,7 +96,7 @@ class FreenectSettings(Settings):
     near_mode: bool = False
     """Depth from 0.4 m on; Kinect for Windows only."""
     led: Led = "green"
-    """Light while the Kinect streams, model 1414; it goes out when the agent ends."""
+    """Light while the Kinect streams; it goes out when the agent ends. 1473 and K4W: with firmware only."""
 
 
 class FreenectSource:
@@ -173,12 +173,12 @@ class FreenectSource:
         match name:
             case "led":
                 led: Led = one_of(Led, name, value)
-                self._motor.set_led(led)
+                shown = self._motor.set_led(led)
                 self._led = led
-                return f"the LED is {led.replace('_', ' ')}"
+                nearest = "" if shown == led else f", the nearest that a {self._camera.model} has"
+                return f"the LED is {shown.replace('_', ' ')}{nearest}"
             case "tilt_deg":
-                tilt_deg = degrees(name, value)
-                self._motor.set_tilt(tilt_deg)
+                tilt_deg = self._motor.set_tilt(degrees(name, value))
                 return f"the Kinect turns to {tilt_deg:g} degrees above the horizon"
             case "restart":
                 return self._restart("stream" if value is True else one_of(RestartStep, name, value))
@@ -222,9 +222,9 @@ class FreenectSource:
                 "libfreenect hangs in a Kinect that stopped answering: start the agent anew",
                 Topic.HANGING_KINECT,
             )
-        self._camera, motor = find_kinect(self._settings)
-        self._motor = Motor(motor)
-        self._accelerometer = Accelerometer(motor)
+        self._camera, self._motor = find_kinect(self._settings)
+        # Opening a 1473 or K4W, libfreenect resets and claims the audio device, which holds the motor.
+        self._accelerometer = Accelerometer(NoMotor("libfreenect opens the Kinect"))
         switches = self._wishes.switches(self._camera.model)
         self._thread = FreenectThread(self._library, self._camera.index, switches)
         try:
@@ -235,6 +235,7 @@ class FreenectSource:
             self.close()
             raise
         self._motor.light(self._led)
+        self._accelerometer = Accelerometer(self._motor)
         self._counts.update(_untold)
         _untold.clear()
         self._last_sign_s = time.monotonic()
@@ -285,8 +286,8 @@ class FreenectSource:
         )
 
 
-def find_kinect(settings: FreenectSettings) -> tuple[usb_bus.KinectCamera, usb_bus.UsbDevice | None]:
-    """The camera to open, and the motor of the same Kinect where it has one."""
+def find_kinect(settings: FreenectSettings) -> tuple[usb_bus.KinectCamera, Motor]:
+    """The camera to open, and the motor of the same Kinect."""
     devices = usb_bus.usb_devices()
     cameras = usb_bus.kinect_cameras(devices)
     camera = usb_bus.choose_camera(cameras, settings.serial, settings.port_path)

@@ -1,7 +1,8 @@
 """The Kinects on this machine's USB buses: found, told apart, checked before a driver takes them.
 
 A Kinect is a hub with a camera and an audio device behind it (model 1414: and a motor). Cameras of
-model 1473 and K4W report the serial number 000…0; the audio device beside them has a real one.
+model 1473 and K4W report the serial number 000…0; the audio device beside them has a real one. It holds
+their motor, too: usb/audio_motor.py.
 """
 
 import logging
@@ -10,6 +11,9 @@ from dataclasses import dataclass
 from typing import Any
 
 from rig_agent.sources.base import SourceLost
+from rig_agent.usb.audio_motor import AudioMotor
+from rig_agent.usb.motor import Motor, NoMotor
+from rig_agent.usb.motor_1414 import Motor1414
 from rig_protocol.errors import ConfigurationError
 from rig_protocol.troubleshooting import Topic
 
@@ -17,6 +21,11 @@ MICROSOFT = 0x045E
 CAMERA_1414_1473, CAMERA_K4W = 0x02AE, 0x02BF
 MOTOR_1414 = 0x02B0
 AUDIO = (0x02AD, 0x02BE, 0x02BB, 0x02C3)
+"""A 1414's and 1473's; a K4W's boot loader, and with firmware of the beta and of the last SDK."""
+LOAD_FIRMWARE = (
+    "put audios.bin into /usr/share/libfreenect and run `freenect-wavrecord` once after each power-on, "
+    "before the agent (docs/control.md, Firmware)"
+)
 _REVISION_1414 = 0x010B  # of the device descriptor; libfreenect tells the models apart by it too
 
 # The name that libfreenect is linked with, so that both ask one and the same library.
@@ -114,11 +123,31 @@ def choose_camera(cameras: Sequence[KinectCamera], serial: str | None, port_path
     )
 
 
-def motor_beside(camera: KinectCamera, devices: Iterable[UsbDevice]) -> UsbDevice | None:
-    """The motor of the same Kinect, which holds its accelerometer; None for models without such a device."""
-    hub = _hub(camera.device)
-    beside = (device for device in devices if device.idProduct == MOTOR_1414 and _hub(device) == hub)
-    return None if hub is None else next(beside, None)
+def motor_beside(camera: KinectCamera, devices: Iterable[UsbDevice]) -> Motor:
+    """LED, tilt and accelerometer of the same Kinect; a NoMotor, which says why, where none can be asked."""
+    beside = _beside(camera.device, devices)
+    if camera.model == "1414":
+        motor = next((device for device in beside if device.idProduct == MOTOR_1414), None)
+        return Motor1414(motor) if motor else NoMotor("this Kinect shows no motor device: a bad plug or hub")
+    audio = next((device for device in beside if device.idProduct in AUDIO), None)
+    if audio is None:
+        return NoMotor("this Kinect shows no audio device, which holds its motor: a bad plug or hub")
+    if not firmware_runs(audio):
+        return NoMotor(
+            f"LED, tilt and accelerometer of a {camera.model} want firmware in its audio device, and none is "
+            f"loaded (images need none): {LOAD_FIRMWARE}"
+        )
+    return AudioMotor(audio)
+
+
+def firmware_runs(audio: UsbDevice) -> bool:
+    """Whether a 1473's or K4W's audio device speaks for the motor: its boot loader has one interface only."""
+    import usb.core
+
+    try:
+        return any(configuration.bNumInterfaces > 1 for configuration in audio.configurations())
+    except usb.core.USBError:  # it vanished
+        return False
 
 
 def check_access(camera: KinectCamera) -> None:
@@ -169,10 +198,8 @@ def _identity(camera: UsbDevice, listed: Sequence[UsbDevice]) -> str | None:
     own = _read_serial(camera)
     if own is None or own.strip("0"):
         return own
-    beside = [
-        device for device in listed if device.idProduct in AUDIO and _hub(device) == _hub(camera) is not None
-    ]
-    return _read_serial(beside[0]) if beside else None
+    audio = next((device for device in _beside(camera, listed) if device.idProduct in AUDIO), None)
+    return None if audio is None else _read_serial(audio)
 
 
 def _read_serial(device: UsbDevice) -> str | None:
@@ -201,6 +228,12 @@ def _port_path(device: UsbDevice) -> str:
 def _hub(device: UsbDevice) -> tuple[int, ...] | None:
     ports = tuple(device.port_numbers or ())
     return (device.bus, *ports[:-1]) if ports else None
+
+
+def _beside(camera: UsbDevice, devices: Iterable[UsbDevice]) -> list[UsbDevice]:
+    """What is behind the same hub, which is the Kinect's own."""
+    hub = _hub(camera)
+    return [] if hub is None else [device for device in devices if _hub(device) == hub]
 
 
 def _is_at(port_path: str, wanted: str | None) -> bool:

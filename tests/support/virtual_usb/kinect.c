@@ -159,6 +159,8 @@ static void power_on(struct kinect *kinect, uint64_t identity)
     kinect->model = model_of(line);
     kinect_read_line(kinect, "first_tick", line, sizeof line);
     kinect->first_tick = (uint32_t)strtoul(line, NULL, 0);
+    kinect->audio_firmware = !has(kinect, "no_firmware");
+    kinect->audio_answer_count = 0;
     for (int kind = 0; kind < IMAGE_KINDS; kind++)
         frame_file_map(&kinect->frames[kind], kinect_path(kinect, FRAME_FILES[kind]), image_bytes(kind));
     for (int id = 0; id < STREAMS; id++)

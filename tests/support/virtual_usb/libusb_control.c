@@ -107,20 +107,31 @@ int libusb_control_transfer(
     return result;
 }
 
-int libusb_bulk_transfer(
-    libusb_device_handle *handle, unsigned char endpoint, unsigned char *data, int size, int *moved,
-    unsigned timeout_ms)
+static int bulk_try(libusb_device_handle *handle, unsigned char endpoint, uint8_t *data, int size)
 {
-    (void)timeout_ms;
     struct kinect *kinect = handle->device->kinect;
     int result = LIBUSB_ERROR_PIPE;
     bus_lock();
+    kinect->next_refresh_ns = 0; /* a fault just made must hold */
     if (!handle_alive(handle))
         result = LIBUSB_ERROR_NO_DEVICE;
     else if (handle->device->function == AUDIO)
         result = endpoint & DEVICE_TO_HOST ? audio_read(kinect, data, size)
                                            : audio_write(kinect, data, size);
     bus_unlock();
+    return result;
+}
+
+int libusb_bulk_transfer(
+    libusb_device_handle *handle, unsigned char endpoint, unsigned char *data, int size, int *moved,
+    unsigned timeout_ms)
+{
+    int64_t end_ns = now_ns() + (timeout_ms ? timeout_ms * 1000000LL : INT64_MAX / 2);
+    int result = bulk_try(handle, endpoint, data, size);
+    while (result == LIBUSB_ERROR_TIMEOUT && now_ns() < end_ns) {
+        sleep_ns(POLL_NS);
+        result = bulk_try(handle, endpoint, data, size);
+    }
     if (moved)
         *moved = result > 0 ? result : 0;
     return result < 0 ? result : 0;

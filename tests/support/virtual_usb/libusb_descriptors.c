@@ -7,6 +7,7 @@
 #define MICROSOFT 0x045e
 #define VENDOR_STRING 2
 #define SERIAL_STRING 3
+#define K4W_BOOT_LOADER 0x02be
 #define NO_SERIAL "0000000000000000" /* what the cameras of later models report */
 
 static const uint16_t PRODUCTS[][FUNCTIONS] = {
@@ -38,13 +39,14 @@ const char *device_string(const struct libusb_device *device, int index)
 int libusb_get_device_descriptor(libusb_device *device, struct libusb_device_descriptor *descriptor)
 {
     enum model model = device->kinect->model;
+    bool boots = model == MODEL_K4W && device->function == AUDIO && !device->kinect->audio_firmware;
     *descriptor = (struct libusb_device_descriptor){
         .bLength = LIBUSB_DT_DEVICE_SIZE,
         .bDescriptorType = LIBUSB_DT_DEVICE,
         .bcdUSB = 0x200,
         .bMaxPacketSize0 = 64,
         .idVendor = MICROSOFT,
-        .idProduct = PRODUCTS[model][device->function],
+        .idProduct = boots ? K4W_BOOT_LOADER : PRODUCTS[model][device->function],
         .bcdDevice = model == MODEL_1414 ? 0x010b : 0x0200, /* how drivers tell the models apart */
         .iProduct = PRODUCT_STRING,
         .iManufacturer = VENDOR_STRING,
@@ -54,35 +56,47 @@ int libusb_get_device_descriptor(libusb_device *device, struct libusb_device_des
     return 0;
 }
 
-#define ENDPOINT(address, size)                                                                        \
-    {.bLength = 7, .bDescriptorType = 5, .bmAttributes = 1, .bInterval = 1, .bEndpointAddress = address, \
+#define ISOCHRONOUS 1
+#define BULK 2
+#define ENDPOINT(kind, address, size)                                                                     \
+    {.bLength = 7, .bDescriptorType = 5, .bmAttributes = kind, .bInterval = 1, .bEndpointAddress = address, \
      .wMaxPacketSize = size}
 #define INTERFACE(number, ...)                                                                      \
     {.bLength = 9, .bDescriptorType = 4, .bInterfaceClass = 0xff, .bInterfaceNumber = number, __VA_ARGS__}
 
 static const struct libusb_endpoint_descriptor CAMERA_ENDPOINTS[STREAMS] = {
-    ENDPOINT(0x81, 0x0bc0),
-    ENDPOINT(0x82, 0x0be0),
+    ENDPOINT(ISOCHRONOUS, 0x81, 0x0bc0),
+    ENDPOINT(ISOCHRONOUS, 0x82, 0x0be0),
+};
+static const struct libusb_endpoint_descriptor AUDIO_ENDPOINTS[2] = {
+    ENDPOINT(BULK, 0x01, 512),
+    ENDPOINT(BULK, 0x81, 512),
 };
 static const struct libusb_interface_descriptor INTERFACES[] = {
     INTERFACE(0, .bNumEndpoints = STREAMS, .endpoint = CAMERA_ENDPOINTS),
     INTERFACE(0),
+    INTERFACE(0, .bNumEndpoints = 2, .endpoint = AUDIO_ENDPOINTS),
     INTERFACE(1),
 };
 static const struct libusb_interface CAMERA_INTERFACES[] = {{&INTERFACES[0], 1}};
-static const struct libusb_interface OTHER_INTERFACES[] = {{&INTERFACES[1], 1}, {&INTERFACES[2], 1}};
+static const struct libusb_interface MOTOR_INTERFACES[] = {{&INTERFACES[1], 1}};
+static const struct libusb_interface AUDIO_INTERFACES[] = {{&INTERFACES[2], 1}, {&INTERFACES[3], 1}};
 
 int libusb_get_config_descriptor(
     libusb_device *device, uint8_t index UNUSED, struct libusb_config_descriptor **out)
 {
+    static const struct libusb_interface *const interfaces[HUB] = {
+        [CAMERA] = CAMERA_INTERFACES, [MOTOR] = MOTOR_INTERFACES, [AUDIO] = AUDIO_INTERFACES,
+    };
+    bool firmware = device->function == AUDIO && device->kinect->audio_firmware;
     struct libusb_config_descriptor *config = calloc(1, sizeof *config);
     *config = (struct libusb_config_descriptor){
         .bLength = 9,
         .bDescriptorType = 2,
-        .bNumInterfaces = device->function == AUDIO ? 2 : 1, /* two: its firmware is loaded */
+        .bNumInterfaces = firmware ? 2 : 1, /* as libfreenect tells whether it is loaded */
         .bConfigurationValue = 1,
         .MaxPower = 8,
-        .interface = device->function == CAMERA ? CAMERA_INTERFACES : OTHER_INTERFACES,
+        .interface = interfaces[device->function],
     };
     *out = config;
     return 0;

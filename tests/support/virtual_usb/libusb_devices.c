@@ -157,6 +157,8 @@ int libusb_reset_device(libusb_device_handle *handle)
         kinect_log(kinect, "reset %s", device_string(handle->device, PRODUCT_STRING));
         if (handle->device->function == CAMERA)
             kinect_reset(kinect);
+        if (handle->device->function == AUDIO)
+            kinect->audio_answer_count = 0;
     }
     bus_unlock();
     return alive ? 0 : LIBUSB_ERROR_NO_DEVICE;

@@ -11,6 +11,9 @@ A bus is a folder with one numbered folder (0 to 7) for each Kinect. In it, the 
     deny, busy, mute, stall            faults: no permission; claimed by another program; never answers
                                        (a USB reset cures it); sends no images
     mute_motor                         fault: the motor, and so the accelerometer, never answers
+    no_firmware                        1473 and k4w: the audio device's boot loader runs, which has no motor;
+                                       written before plugging
+    audio_fault                        magic, tag, status or short: what is wrong with its acknowledgements
     deaf_sensor                        fault: the colour sensor takes no exposure and white balance
     lose                               percent of image packets lost at random
     lose_video_packet, …_depth_…       "p n": packet p of every n-th frame is lost

@@ -24,6 +24,7 @@
 #define SLOT_NS 125000LL /* a USB 2 microframe; one isochronous packet per endpoint and microframe */
 #define REGISTERS 0x400
 #define PRODUCT_STRING 1
+#define AUDIO_ANSWERS 8
 
 enum model { MODEL_1414, MODEL_1473, MODEL_K4W };
 enum function { CAMERA, MOTOR, AUDIO, HUB, FUNCTIONS };
@@ -62,12 +63,18 @@ struct stream {
     int64_t next_free_slot; /* the slots of pending transfers end here */
 };
 
+/* What an audio device sends at one reading. */
+struct audio_answer {
+    uint8_t bytes[104];
+    int length;
+};
+
 /* What a test may switch on while the device is in use. */
 struct faults {
     bool deny;                /* opening fails with EACCES */
     bool busy;                /* another program has claimed the camera */
     bool mute;                /* the camera never answers control transfers; a reset cures it */
-    bool mute_motor;          /* the motor never answers control transfers */
+    bool mute_motor;          /* the motor never answers; an audio device keeps its answers for later */
     bool deaf_sensor;         /* commands to the colour sensor's registers fail */
     bool stall;               /* isochronous packets stay empty */
     double lose_percent;      /* of isochronous packets, at random */
@@ -98,8 +105,9 @@ struct kinect {
     uint16_t cmos[REGISTERS];
     uint8_t reply[0x200];
     int reply_length;
-    uint32_t audio_command;
-    uint32_t audio_tag;
+    bool audio_firmware; /* loaded; else the audio device's boot loader answers nothing */
+    struct audio_answer audio_answers[AUDIO_ANSWERS];
+    int audio_answer_count; /* waiting to be read, oldest first */
 
     struct frame_file frames[IMAGE_KINDS];
     struct stream streams[STREAMS];
@@ -130,7 +138,7 @@ bool handle_alive(libusb_device_handle *handle);
 void camera_command(struct kinect *kinect, const uint8_t *request, int length);
 int camera_reply(struct kinect *kinect, uint8_t *data, int size);
 
-/* motor_commands.c; return the bytes moved or a libusb error */
+/* motor_commands.c; return the bytes moved or a libusb error, and reading TIMEOUT while there is nothing */
 int motor_control(struct kinect *kinect, int type, int request, int value, uint8_t *data, int size);
 int audio_write(struct kinect *kinect, const uint8_t *data, int size);
 int audio_read(struct kinect *kinect, uint8_t *data, int size);

@@ -13,7 +13,7 @@ from rig_agent.doctor.usb import usb as look
 from rig_agent.sources.base import SourceLost
 from rig_agent.sources.freenect import FreenectSettings
 from rig_protocol.troubleshooting import Topic
-from support.pi_tree import AUDIO, AUDIO_K4W, CAMERA_K4W, FULL_SPEED, PiTree, device, kinect_1414
+from support.pi_tree import AUDIO, AUDIO_K4W, CAMERA, CAMERA_K4W, FULL_SPEED, PiTree, device, kinect_1414
 
 
 @pytest.fixture(autouse=True)
@@ -65,8 +65,16 @@ def test_a_later_model_has_no_motor_of_its_own_and_wants_firmware_for_led_and_ti
     found = findings(machine)
     assert found[Check.FUNCTIONS].status == Status.OK
     assert found[Check.FIRMWARE].status == Status.SKIPPED
+    assert "sudo install" in str(found[Check.FIRMWARE].mend)
     pi.write("/usr/share/libfreenect/audios.bin", "")
-    assert findings(machine)[Check.FIRMWARE].status == Status.OK
+    not_loaded = findings(machine)[Check.FIRMWARE]
+    assert (not_loaded.status, "is not loaded" in not_loaded.text) == (Status.SKIPPED, True)
+
+
+def test_firmware_that_runs_is_told_from_firmware_that_lies_on_the_disk(pi: PiTree) -> None:
+    audio = device(AUDIO, (1, 3), 0x0200, interfaces=2)  # of a 1473, whose product id stays the same
+    kinect = [device(CAMERA, (1, 1), 0x0200), audio]
+    assert findings(pi.machine(usb_devices=lambda: kinect))[Check.FIRMWARE].status == Status.OK
 
 
 def test_a_camera_at_full_speed_carries_no_images(pi: PiTree) -> None:

@@ -9,7 +9,9 @@ import pytest
 import usb.core
 import usb.util
 
-from rig_agent.usb.accelerometer import COUNTS_PER_G, READINGS, Accelerometer, Reading, gravity_of
+from rig_agent.usb.accelerometer import COUNTS_PER_G, READINGS, Accelerometer, gravity_of
+from rig_agent.usb.motor import NoMotor, Reading
+from rig_agent.usb.motor_1414 import Motor1414, parse_state
 
 RNG = np.random.default_rng(3)
 LEVEL = (0, 819, 0)
@@ -23,7 +25,7 @@ def answer(x: int, y: int, z: int, status: int = 0) -> bytes:
 
 def readings(x: float, y: float, z: float, noise: float = 2.0, count: int = READINGS) -> list[Reading]:
     felt = np.rint(np.array([x, y, z]) + noise * RNG.standard_normal((count, 3))).astype(int)
-    return [Reading.parse(answer(*one.tolist())) for one in felt]
+    return [parse_state(answer(*one.tolist())) for one in felt]
 
 
 @pytest.mark.parametrize(
@@ -61,7 +63,7 @@ def test_readings_are_averaged() -> None:
         readings(0, 0.8 * COUNTS_PER_G, 0),
         readings(0, 1.2 * COUNTS_PER_G, 0),
         readings(0, 0, 0),
-        [*readings(*LEVEL), Reading.parse(answer(*LEVEL, status=4))],
+        [*readings(*LEVEL), parse_state(answer(*LEVEL, status=4))],
     ],
     ids=["too few", "none", "shaken", "turned", "falling", "pushed", "a dead sensor", "the motor turns it"],
 )
@@ -96,7 +98,7 @@ class Motor:
 def feel(monkeypatch: pytest.MonkeyPatch) -> Callable[[Motor], Accelerometer]:
     monkeypatch.setattr("rig_agent.usb.accelerometer._RETRY_S", 0.001)
     monkeypatch.setattr(usb.util, "dispose_resources", lambda _device: None)
-    return lambda motor: Accelerometer(motor, interval_s=0.001)
+    return lambda motor: Accelerometer(Motor1414(motor), interval_s=0.001)
 
 
 SILENT = usb.core.USBError("Operation timed out", -7, 110)
@@ -142,6 +144,6 @@ def test_what_was_felt_two_seconds_ago_is_forgotten(
 
 
 def test_a_kinect_without_motor_feels_nothing() -> None:
-    accelerometer = Accelerometer(None)
+    accelerometer = Accelerometer(NoMotor("none is there"))
     assert accelerometer.gravity is None
     accelerometer.close()

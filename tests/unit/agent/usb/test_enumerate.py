@@ -7,7 +7,7 @@ import pytest
 import usb.core
 import usb.util
 
-from rig_agent.sources.base import SourceLost
+from rig_agent.sources.base import ControlRefused, SourceLost
 from rig_agent.usb.enumerate import KinectCamera, choose_camera, kinect_cameras, motor_beside
 from rig_protocol.errors import ConfigurationError
 
@@ -15,7 +15,11 @@ ZEROS = "0000000000000000"
 
 
 def device(
-    product: int, ports: tuple[int, ...], serial: str | Exception | None, revision: int = 0x010B
+    product: int,
+    ports: tuple[int, ...],
+    serial: str | Exception | None,
+    revision: int = 0x010B,
+    interfaces: int = 1,
 ) -> Any:
     return SimpleNamespace(
         idProduct=product,
@@ -25,6 +29,7 @@ def device(
         port_numbers=ports,
         iSerialNumber=0 if serial is None else 3,
         serial=serial,
+        configurations=lambda: (SimpleNamespace(bNumInterfaces=interfaces),),
     )
 
 
@@ -116,8 +121,44 @@ def test_two_kinects_and_no_choice_lists_them() -> None:
         choose_camera(cameras(), None, None)
 
 
-def test_the_motor_is_that_of_the_same_kinect_where_models_are_mixed() -> None:
-    devices = [*kinect_1473(1, "B"), *kinect_1414(2, "A"), *kinect_1414(3, "C"), *kinect_k4w(4, "D")]
-    cameras = kinect_cameras(devices)
-    motors = [motor_beside(camera, devices) for camera in cameras]
-    assert [motor and motor.port_numbers for motor in motors] == [None, (2, 2), (3, 2), None]
+def test_the_motor_is_that_of_the_same_kinect_where_models_are_mixed(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr("rig_agent.usb.enumerate.Motor1414", lambda device: ("1414", device.port_numbers))
+    monkeypatch.setattr("rig_agent.usb.enumerate.AudioMotor", lambda device: ("audio", device.port_numbers))
+    with_firmware = [
+        device(0x02BF, (4, 1), ZEROS, 0x0200),
+        device(0x02C3, (4, 3), "D", 0x0200, interfaces=4),
+    ]
+    later = [device(0x02AE, (1, 1), ZEROS, 0x0200), device(0x02AD, (1, 3), "B", 0x0200, interfaces=2)]
+    devices = [*later, *kinect_1414(2, "A"), *kinect_1414(3, "C"), *with_firmware]
+    motors = [motor_beside(camera, devices) for camera in kinect_cameras(devices)]
+    assert motors == [("audio", (1, 3)), ("1414", (2, 2)), ("1414", (3, 2)), ("audio", (4, 3))]
+
+
+@pytest.mark.parametrize(
+    ("kinect", "words"),
+    [
+        (kinect_1473(1, "A"), "a 1473 want firmware .*freenect-wavrecord"),
+        (kinect_k4w(1, "A"), "a K4W want firmware"),
+        (kinect_1473(1, "A")[:1], "no audio device"),
+        (kinect_1414(1, "A")[:1], "no motor device"),
+    ],
+    ids=["1473 in its boot loader", "K4W in its boot loader", "1473 without audio", "1414 without motor"],
+)
+def test_a_kinect_whose_motor_cannot_be_asked_says_why(kinect: list[Any], words: str) -> None:
+    motor = motor_beside(kinect_cameras(kinect)[0], kinect)
+    assert not motor.is_there
+    for ask in (motor.feel, lambda: motor.set_led("red"), lambda: motor.set_tilt(3)):
+        with pytest.raises(ControlRefused, match=words):
+            ask()
+    motor.close()
+
+
+def test_an_audio_device_that_vanishes_while_it_is_looked_at_is_no_motor() -> None:
+    def gone() -> None:
+        raise usb.core.USBError("No such device", -4, 19)
+
+    kinect = kinect_1473(1, "A")
+    kinect[1].configurations = gone
+    assert not motor_beside(kinect_cameras(kinect)[0], kinect).is_there
