@@ -113,9 +113,10 @@ def _copy_pip_settings(root: Path) -> None:
     kept = {key: " ".join(settings[key].split()) for key in _PIP_OPTIONS if key in settings}
     (root / "etc/pip.conf").write_text("".join(["[global]\n", *(f"{k} = {v}\n" for k, v in kept.items())]))
     if "cert" in kept:
-        copy = root / kept["cert"].lstrip("/")
-        copy.parent.mkdir(parents=True, exist_ok=True)
-        shutil.copyfile(kept["cert"], copy)
+        # The second copy is for the package ca-certificates, which makes the system's bundle anew.
+        for place in (kept["cert"].lstrip("/"), "usr/local/share/ca-certificates/test-machine.crt"):
+            (root / place).parent.mkdir(parents=True, exist_ok=True)
+            shutil.copyfile(kept["cert"], root / place)
 
 
 def _run(words: Sequence[str], *, check: bool = True) -> str:
