@@ -28,6 +28,8 @@ _EXAMPLES = """
 
 `rig-server --watch calibration/calibration.json` — the same, and an alarm when a camera has moved
 
+`rig-server --record take.mcap` — the same, and everything that comes on the disk
+
 `rig-server --metrics 9100` — the same, and metrics for a Prometheus on this machine
 
 `rig-server --calibrate --out calibration` — calibrate the ring that streams to this PC
@@ -119,6 +121,10 @@ def run(
     out: Annotated[
         Path | None, typer.Option(metavar="DIR", help="Folder for the results; else ./calibration.")
     ] = None,
+    record: Annotated[
+        Path | None,
+        typer.Option(metavar="FILE.mcap", help="Record what comes, as it comes (docs/recording.md)."),
+    ] = None,
     watch: Annotated[
         Path | None,
         typer.Option(metavar="CALIBRATION", help="Say when a camera moves from its place in this file."),
@@ -183,7 +189,7 @@ def run(
     if not calibrate:
         from rig_server.receiving import receive
 
-        with _open_rig(settings, simulate, seed) as rig:
+        with _open_rig(settings, simulate, seed, record) as rig:
             receive(rig, console)
         return
     from rig_calib.outputs import known_calibration, make_output_folder
@@ -193,7 +199,7 @@ def run(
     folder = out or Path("calibration")
     known = known_calibration(recalibrate, calibration, folder)
     make_output_folder(folder)
-    with _open_rig(settings, simulate, seed) as rig:
+    with _open_rig(settings, simulate, seed, record) as rig:
         if recalibrate is None or known is None:
             task = CalibrationTask.whole_rig(rig.settings, coach)
         else:
@@ -290,7 +296,9 @@ def budget(
 
 
 @contextlib.contextmanager
-def _open_rig(settings: "RigSettings", simulate: int | None, seed: int | None) -> Iterator["Rig"]:
+def _open_rig(
+    settings: "RigSettings", simulate: int | None, seed: int | None, record: Path | None
+) -> Iterator["Rig"]:
     """The rig that the options ask for, not begun yet, and its metrics where settings ask for them."""
     from rig_server.announcement import announced
     from rig_server.metrics_endpoint import metrics_served
@@ -298,7 +306,10 @@ def _open_rig(settings: "RigSettings", simulate: int | None, seed: int | None) -
     from rig_server.operator_socket import operator_served
     from rig_server.rig import Rig
 
-    rig = Rig.live(settings) if simulate is None else Rig.simulated(simulate, seed or 0, settings=settings)
+    if simulate is None:
+        rig = Rig.live(settings, record)
+    else:
+        rig = Rig.simulated(simulate, seed or 0, settings=settings, record=record)
     with (
         contextlib.closing(rig),
         metrics_served(settings.metrics_address, rig.status),

@@ -120,9 +120,12 @@ class Rig:
         return cls.simulated(int(rest), settings=settings)
 
     @classmethod
-    def live(cls, settings: RigSettings) -> Self:
-        """The agents that stream to this machine, at the address that the settings state."""
-        return cls(LivePipeline(settings, rig_key(settings.key_file, settings.insecure)), settings)
+    def live(cls, settings: RigSettings, record: Path | None = None) -> Self:
+        """The agents that stream to this machine, at the address that the settings state.
+
+        `record`: a new file to record the take to (docs/recording.md).
+        """
+        return cls(LivePipeline(settings, rig_key(settings.key_file, settings.insecure), record), settings)
 
     @classmethod
     def simulated(
@@ -131,11 +134,12 @@ class Rig:
         seed: int = 0,
         fps: float = SIMULATED_FPS,
         settings: RigSettings | None = None,
+        record: Path | None = None,
     ) -> Self:
         """A ring of simulated agents: processes of this machine that stream over loopback UDP."""
         settings = simulated_settings(settings or load_rig_settings(None), cameras)
         key = RigKey.generate(secrets.token_bytes)
-        pipeline = LivePipeline(settings, key)
+        pipeline = LivePipeline(settings, key, record)
         return cls(pipeline, settings, Simulation(cameras, seed, fps, pipeline.address, key))
 
     def __enter__(self) -> Self:
