@@ -24,6 +24,7 @@ from rig_server.config import MAX_CAMERAS, RigSettings, load_rig_settings, parse
 from rig_server.metrics import RigStatus
 from rig_server.pipeline import LivePipeline
 from rig_server.recorded import RecordedRig
+from rig_server.replay import ReplayedRig, ReplayOptions
 from rig_server.simulation import SIMULATED_FPS, Simulation, simulated_settings
 from rig_server.sinks.watch import WatchSink
 
@@ -36,7 +37,7 @@ class Feed(Protocol):
 
     @property
     def source(self) -> str:
-        """`udp` or `folder`, for the provenance of a result."""
+        """`udp`, `folder` or `recording`, for the provenance of a result."""
         ...
 
     @property
@@ -104,12 +105,14 @@ class Rig:
 
     @classmethod
     def open(cls, source: str | Path, settings: RigSettings | None = None) -> Self:
-        """A rig from `udp://HOST:PORT` (listen there), `simulated:N`, or the path of a rig folder.
+        """A rig from `udp://HOST:PORT` (listen there), `simulated:N`, a rig folder, or a recording FILE.mcap.
 
         Settings: None reads rig.toml as `rig-server` does. ConfigurationError when the source makes no sense.
         """
         settings = settings or load_rig_settings(None)
         match = _LIVE_SOURCE.fullmatch(str(source))
+        if match is None and Path(source).suffix == ".mcap":
+            return cls.replayed(Path(source), settings)
         if match is None:
             return cls(RecordedRig(Path(source)), settings)
         kind, rest = match.groups()
@@ -126,6 +129,14 @@ class Rig:
         `record`: a new file to record the take to (docs/recording.md).
         """
         return cls(LivePipeline(settings, rig_key(settings.key_file, settings.insecure), record), settings)
+
+    @classmethod
+    def replayed(cls, take: Path, settings: RigSettings, options: ReplayOptions | None = None) -> Self:
+        """A recorded take; the default options play it once, at the speed at which it was recorded.
+
+        ConfigurationError when there is no such file, DataError when it is no recording.
+        """
+        return cls(ReplayedRig(take, settings, options or ReplayOptions()), settings)
 
     @classmethod
     def simulated(
@@ -225,7 +236,7 @@ class Rig:
 
     @property
     def source(self) -> str:
-        """`udp` or `folder`."""
+        """`udp`, `folder` or `recording`."""
         return self._feed.source
 
     @property
@@ -235,7 +246,7 @@ class Rig:
 
     @property
     def hellos(self) -> Mapping[int, Hello]:
-        """What the agents said of themselves, by camera id; empty for a recording."""
+        """What the agents said of themselves, by camera id; empty for a rig folder."""
         return self._feed.hellos
 
     @property
