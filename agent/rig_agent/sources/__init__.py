@@ -39,6 +39,19 @@ def _open_folder(settings: "AgentSettings") -> "FrameSource":
     return FolderSource(settings.folder.path, camera, settings.fps or _FOLDER_FPS)
 
 
+def _open_recording(settings: "AgentSettings") -> "FrameSource":
+    from rig_agent.sources.recording import RecordingSource
+
+    camera = settings.camera if settings.recording.camera is None else settings.recording.camera
+    if settings.recording.path is None:
+        raise ConfigurationError("source recording needs a file: give --path, or `path` in [recording]")
+    if camera is None:
+        raise ConfigurationError(
+            "source recording plays one camera: give --camera (or `camera` in [recording])"
+        )
+    return RecordingSource(settings.recording.path, camera)
+
+
 def _open_synthetic(settings: "AgentSettings") -> "FrameSource":
     from rig_agent.sources.synthetic import SyntheticSource
 
@@ -50,5 +63,6 @@ _OPENERS = {
     "freenect": _open_freenect,
     "openni2": _open_openni2,
     "folder": _open_folder,
+    "recording": _open_recording,
     "synthetic": _open_synthetic,
 }
