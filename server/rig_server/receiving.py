@@ -28,6 +28,7 @@ def receive(rig: Rig, console: Console) -> None:
         at_the_end.callback(service_manager.notify, "STOPPING=1")
         service_manager.notify("READY=1")
         turns, next_update_s = 0, time.monotonic()
+        at_the_end.callback(_tell_end, rig, console)
         while not rig.ended:
             rig.next_panorama(_UPDATE_S)
             if time.monotonic() < next_update_s:
@@ -38,3 +39,14 @@ def receive(rig: Rig, console: Console) -> None:
             if status.turns != turns:
                 turns = status.turns
                 service_manager.feed_watchdog(time.monotonic_ns())
+
+
+def _tell_end(rig: Rig, console: Console) -> None:
+    """The totals of what was replayed to its end."""
+    if rig.ended:
+        status = rig.status()
+        console.print(
+            f"{rig.place} has ended: {status.complete} complete, {status.partial} partial sets",
+            soft_wrap=True,
+            markup=False,
+        )

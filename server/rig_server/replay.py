@@ -3,7 +3,7 @@
 import logging
 import threading
 import time
-from collections import Counter, deque
+from collections import Counter
 from collections.abc import Collection, Iterable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
@@ -16,6 +16,7 @@ from rig_protocol.errors import ConfigurationError, DataError, RigError
 from rig_protocol.events import ControlAnswered
 from rig_protocol.frames import EncodedFrame, PanoramicFrame, RgbdFrame
 from rig_protocol.messages import ControlValue, Hello
+from rig_protocol.recorded_sets import EncodedSet, with_frames
 from rig_protocol.recording import HELLOS, Recording
 from rig_protocol.recording_format import Entry, RecordedSet, time_of
 from rig_protocol.rig_folder import RigDescription
@@ -28,9 +29,6 @@ from rig_server.take_documents import recorded_hellos
 
 logger = logging.getLogger(__name__)
 
-# Frames of a camera that a set may still ask for: those that waited in the synchroniser (8) and in sets that
-# nobody had taken (4), and as many again.
-_REMEMBERED = 24
 _LEAD_IN_NS = 2_000_000_000  # frames of the first set after a seek came before it
 
 
@@ -41,15 +39,6 @@ class ReplayOptions:
     speed: float | None = 1.0
     loop: bool = False
     seek_s: float = 0.0
-
-
-@dataclass(frozen=True, slots=True)
-class EncodedSet:
-    """A set whose frames are still as they came; None where it has none, or the file lacks it."""
-
-    index: int
-    time_ns: int
-    frames: Mapping[int, EncodedFrame | None]
 
 
 class ReplayedRig:
@@ -192,21 +181,6 @@ class ReplayedRig:
         return panorama
 
 
-def with_frames(entries: Iterable[Entry], from_ns: int = 0) -> Iterator[EncodedSet]:
-    """The sets that went out from a time on, with their frames; one that has no frame is left out."""
-    came: dict[int, deque[EncodedFrame]] = {}
-    for entry in entries:
-        if isinstance(entry, EncodedFrame):
-            came.setdefault(entry.camera_id, deque(maxlen=_REMEMBERED)).append(entry)
-        elif isinstance(entry, RecordedSet) and entry.taken_ns >= from_ns:
-            frames = {
-                camera_id: _stamped(came.get(camera_id, ()), time_ns)
-                for camera_id, time_ns in entry.timestamps_ns.items()
-            }
-            if any(frames.values()):
-                yield EncodedSet(entry.index, entry.taken_ns, frames)
-
-
 def with_sets(entries: Iterable[Entry], synchroniser: Synchroniser) -> Iterator[Entry]:
     """The entries of a take without sets, and the sets that the synchroniser makes, in recorded time."""
     now_ns = 0
@@ -230,10 +204,6 @@ def _sets_due(synchroniser: Synchroniser, now_ns: int) -> Iterator[RecordedSet]:
 
 def _without_images(frame: EncodedFrame) -> RgbdFrame:
     return RgbdFrame(frame.camera_id, frame.sequence, frame.timestamp_ns, frame.uncertainty_ns)
-
-
-def _stamped(came: Iterable[EncodedFrame], time_ns: int | None) -> EncodedFrame | None:
-    return next((frame for frame in came if frame.timestamp_ns == time_ns), None)
 
 
 def _decode(frame: EncodedFrame | None, demosaic: bool) -> RgbdFrame | None:

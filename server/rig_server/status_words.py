@@ -58,7 +58,8 @@ def alarms(status: RigStatus) -> list[str]:
 def _recording(recording: RecordingStatus) -> str:
     """How long, how much, and for how long the disk has room at this rate."""
     rate = recording.bytes_per_s
-    left = f", room for {_duration(max(recording.free_bytes, 0) / rate)}" if rate else ""
+    known = recording.seconds >= 2 and rate > 0  # before, the rate is that of the file's head
+    left = f", room for {_duration(max(recording.free_bytes, 0) / rate)}" if known else ""
     size = f"{recording.bytes / 1e9:.2f} GB, {rate / 1e6:.0f} MB/s"
     return f"recording {recording.path.name}: {_duration(recording.seconds)}, {size}{left}"
 
