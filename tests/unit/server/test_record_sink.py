@@ -8,6 +8,7 @@ import sys
 import threading
 import time
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -20,7 +21,9 @@ from rig_protocol.recording import MANIFEST, Recording, part_paths
 from rig_protocol.recording_format import DroppedFrames, RecordedSet
 from rig_server import Rig
 from rig_server.config import RecordingSettings, RigSettings, SynchroniserSettings
+from rig_server.metrics import RecordingStatus, RigStatus
 from rig_server.sinks.record import RecordSink
+from rig_server.status_words import alarms, summary
 from rig_server.take_file import TakeFile
 from support.small_agent import BAYER, COLOR, RAW, SmallAgent
 
@@ -213,3 +216,14 @@ def test_a_live_rig_records_what_came_before_it_gives_the_first_set(tmp_path: Pa
     assert recording.description.camera_ids == (0, 1)
     assert json.loads(recording.attachments["settings.json"])["expected_cameras"] == 2
     assert recording.document(MANIFEST)["received"]["1"]["frames"] > 0
+
+
+def test_the_operator_reads_how_the_recording_is_and_why_it_ended() -> None:
+    going = RecordingStatus(Path("takes/a.mcap"), 75.0, 1860, 3_000_000_000, 0, 0, 288_000_000_000)
+    figures, troubles = summary(RigStatus((), recording=going))
+    assert "recording a.mcap: 1:15, 3.00 GB, 40 MB/s, room for 2 h 00 min" in figures
+    assert troubles == []
+    slow = replace(going, dropped=7, ended="the disk is full")
+    figures, troubles = summary(RigStatus((), recording=slow))
+    assert "frames not recorded: 7" in troubles
+    assert alarms(RigStatus((), recording=slow)) == ["recording takes/a.mcap ended: the disk is full"]

@@ -166,3 +166,21 @@ def test_a_frame_that_does_not_decode_is_missing_from_its_set(
     sets = played(tmp_path / "bad.mcap")
     assert len(sets) == len(live)
     assert all(one.missing == (1,) for one in sets)
+
+
+def test_a_frame_that_was_not_recorded_is_missing_from_its_set(
+    take: tuple[Path, list[PanoramicFrame]], tmp_path: Path
+) -> None:
+    path, live = take
+    recording = Recording(path)
+    with (tmp_path / "lossy.mcap").open("wb") as output:
+        writer = RecordingWriter(output, "", 0)
+        for name in (DESCRIPTION, HELLOS):
+            writer.attach(name, recording.document(name), 0)
+        for entry in recording.entries():
+            if not (isinstance(entry, EncodedFrame) and entry.camera_id == 0):
+                writer.write(entry)
+        writer.finish()
+    sets = played(tmp_path / "lossy.mcap")
+    assert [one.index for one in sets] == [one.index for one in live]
+    assert all(one.missing == (0,) for one in sets)
