@@ -228,7 +228,7 @@ def test_the_doctor_finds_nothing_wrong_but_the_hardware(site: Site, source: str
     ]
     said = site.machines["pi"].run(*words, check=False)
     report = json.loads(said)
-    lines = [f"{one['status']} {one['check']}: {one['text']}" for one in report["findings"]]
+    lines = [f"{one['status']} {one['name']}: {one['message']}" for one in report["checks"]]
     print("\n".join(lines))
     assert report["passed_but_for_hardware"], said
 

@@ -59,12 +59,14 @@ class Finding:
     topic: Topic | None = None
 
     def to_dict(self) -> dict[str, object]:
-        """As `--json` prints it."""
+        """As `--json` prints it; what was skipped is no trouble, and says so in a key of its own."""
+        is_skipped = self.status == Status.SKIPPED
         return {
-            "check": self.check.value,
-            "status": self.status.value,
-            "text": self.text,
-            "mend": self.mend,
+            "name": self.check.value,
+            "status": (Status.OK if is_skipped else self.status).value,
+            "message": self.text,
+            "fix": self.mend,
+            "skipped": is_skipped,
             "hardware": self.hardware,
             "see": None if self.topic is None else reference(self.topic).removeprefix("see "),
         }

@@ -55,6 +55,6 @@ def to_json(findings: Sequence[Finding], source: str) -> str:
         "source": source,
         "passed": passed(findings),
         "passed_but_for_hardware": all(finding.hardware for finding in failures),
-        "findings": [finding.to_dict() for finding in findings],
+        "checks": [finding.to_dict() for finding in findings],
     }
     return json.dumps(report, indent=2, ensure_ascii=False)

@@ -17,7 +17,7 @@ from rig_agent import cli
 from rig_agent.config import AgentSettings
 from rig_agent.doctor import examination, report
 from rig_agent.doctor.examination import examine
-from rig_agent.doctor.finding import Check, Finding, Status, failed, ok, warning
+from rig_agent.doctor.finding import Check, Finding, Status, failed, ok, skipped, warning
 from rig_agent.doctor.frames import frames
 from rig_agent.sources.base import SourceLost
 from rig_protocol.errors import ConfigurationError
@@ -139,10 +139,15 @@ def test_only_failures_fail(found: list[Finding], status: int, monkeypatch: pyte
     result = CliRunner().invoke(cli.app, words)
     assert result.exit_code == status
     told = json.loads(result.stdout)
-    assert set(told) == {"software", "source", "passed", "passed_but_for_hardware", "findings"}
-    assert [set(one) for one in told["findings"]] == [
-        {"check", "status", "text", "mend", "hardware", "see"}
+    assert set(told) == {"software", "source", "passed", "passed_but_for_hardware", "checks"}
+    assert [set(one) for one in told["checks"]] == [
+        {"name", "status", "message", "fix", "skipped", "hardware", "see"}
     ] * 2
+
+
+def test_scripts_know_three_statuses_and_what_was_skipped_is_none_of_their_trouble() -> None:
+    told = [finding.to_dict() for finding in (skipped(Check.POWER, "no Pi"), failed(Check.KEY, "none"))]
+    assert [(one["status"], one["skipped"]) for one in told] == [("ok", True), ("failed", False)]
 
 
 def test_json_without_check_is_refused() -> None:
