@@ -36,7 +36,7 @@ from rig_server.decoder import FrameDecoder
 from rig_server.description import describe_rig
 from rig_server.durations import Durations
 from rig_server.link_budget import Port
-from rig_server.metrics import RigStatus
+from rig_server.metrics import RecordingStatus, RigStatus
 from rig_server.receiver import Receiver, rig_time_ns
 from rig_server.remote_control import RemoteControl
 from rig_server.rig_status import StatusReader
@@ -99,9 +99,9 @@ class LivePipeline:
             self._durations,
             self._streams,
         )
-        self._record = None
-        if record is not None:
-            self._record = RecordSink(record, settings.recording, self._documents, self._camera_counts)
+        self._take = record
+        self._recording = threading.Lock()  # one thread at a time starts or ends a recording
+        self._record: RecordSink | None = None
         self._system_clock = SystemClock(rig_time_ns, time.time_ns)
         self._system_clock_read_ns = 0
         self._presence = threading.Lock()  # guards what follows
@@ -134,16 +134,36 @@ class LivePipeline:
 
     def start(self) -> None:
         """Start receiving, and recording before; ConfigurationError where that is not possible."""
-        if self._record is not None:
-            self._record.start()
+        if self._take is not None:
+            self.start_recording(self._take)
         self._receiver.start()
 
     def stop(self) -> None:
         """Say goodbye to the cameras and end all threads; harmless when already stopped."""
         self._receiver.stop()
         self._decoder.close()
-        if self._record is not None:
-            self._record.stop()
+        self.stop_recording()
+
+    def start_recording(self, take: Path) -> None:
+        """Record to a new file from now on.
+
+        ConfigurationError when it exists or cannot be written, RigError while another recording runs.
+        """
+        with self._recording:
+            if self._record is not None and self._record.status().ended is None:
+                raise RigError(f"{self._record.status().path} is being recorded: stop that first")
+            record = RecordSink(take, self._settings.recording, self._documents, self._camera_counts)
+            record.start()
+            self._record = record
+
+    def stop_recording(self) -> RecordingStatus | None:
+        """End the recording in order; how it was, None where nobody recorded."""
+        with self._recording:
+            record, self._record = self._record, None
+            if record is None:
+                return None
+            record.stop()
+            return record.status()
 
     def absence(self) -> str | None:
         """Which expected cameras are not here and what to do, or None; RigError when receiving has failed."""
@@ -158,15 +178,17 @@ class LivePipeline:
         """The next set, or None when none came within `timeout_s`; RigError when receiving has failed."""
         self._check_receiver()
         panorama = self._assembler.next_panorama(timeout_s)
-        if panorama is not None and self._record is not None:
-            self._record.add_set(panorama)
+        record = self._record
+        if panorama is not None and record is not None:
+            record.add_set(panorama)
         return panorama
 
     def status(self) -> RigStatus:
         """The rig at this moment; any thread may ask."""
         with self._presence:
             unassigned = self._unassigned.here(rig_time_ns())
-        recording = None if self._record is None else self._record.status()
+        record = self._record
+        recording = None if record is None else record.status()
         return replace(self._status.read(self.hellos), unassigned=unassigned, recording=recording)
 
     def control(
@@ -205,8 +227,9 @@ class LivePipeline:
         self._streams.take(event, rig_time_ns())
         match event:
             case FrameReceived(frame):
-                if self._record is not None:
-                    self._record.add_frame(frame)
+                record = self._record  # others end it
+                if record is not None:
+                    record.add_frame(frame)
                 self._decoder.submit(frame)
             case CameraJoined(camera_id, hello, address):
                 self._assembler.camera_joined(camera_id, hello.fps)

@@ -116,6 +116,13 @@ class ReplayedRig:
         """A recording's cameras are what they are: RigError."""
         raise RigError(f"{self.place} is no live rig: slot {slot.camera_id} cannot be given away")
 
+    def start_recording(self, take: Path) -> None:
+        """What was captured already is not recorded again: RigError."""
+        raise RigError(f"{self.place} is no live rig: copy it instead of recording {take}")
+
+    def stop_recording(self) -> None:
+        """Nobody records."""
+
     def status(self) -> RigStatus:
         """Cameras and sets given so far, and their rates; any thread may ask."""
         with self._counting:

@@ -21,7 +21,7 @@ from rig_protocol.rig_key import RigKey
 from rig_protocol.roster import Slot
 from rig_protocol.troubleshooting import Topic
 from rig_server.config import MAX_CAMERAS, RigSettings, load_rig_settings, parse_address
-from rig_server.metrics import RigStatus
+from rig_server.metrics import RecordingStatus, RigStatus
 from rig_server.pipeline import LivePipeline
 from rig_server.recorded import RecordedRig
 from rig_server.replay import ReplayedRig, ReplayOptions
@@ -84,6 +84,14 @@ class Feed(Protocol):
 
     def assign(self, slot: Slot) -> None:
         """Give a slot to a camera."""
+        ...
+
+    def start_recording(self, take: Path) -> None:
+        """Record to a new file from now on."""
+        ...
+
+    def stop_recording(self) -> RecordingStatus | None:
+        """End the recording in order; how it was."""
         ...
 
     def status(self) -> RigStatus:
@@ -228,6 +236,18 @@ class Rig:
     def assign(self, slot: Slot) -> None:
         """Give a slot to a camera, until the rig ends (`rig-server assign` writes rig.toml, too)."""
         self._feed.assign(slot)
+
+    def start_recording(self, take: Path) -> None:
+        """Record to a new file from now on; any thread may ask.
+
+        ConfigurationError when it exists or cannot be written; RigError while another recording runs, and
+        for a rig that is no live one.
+        """
+        self._feed.start_recording(take)
+
+    def stop_recording(self) -> RecordingStatus | None:
+        """End the recording in order and say how it was; None where nobody recorded."""
+        return self._feed.stop_recording()
 
     @property
     def description(self) -> RigDescription:

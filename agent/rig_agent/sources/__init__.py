@@ -1,5 +1,6 @@
 """The drivers of cameras, by name. A driver and its libraries are imported when it is opened."""
 
+import importlib.util
 from typing import TYPE_CHECKING
 
 from rig_protocol.errors import ConfigurationError
@@ -49,6 +50,10 @@ def _open_recording(settings: "AgentSettings") -> "FrameSource":
         raise ConfigurationError(
             "source recording plays one camera: give --camera (or `camera` in [recording])"
         )
+    missing = [name for name in ("mcap", "numba") if importlib.util.find_spec(name) is None]
+    if missing:
+        told = " and ".join(missing)
+        raise ConfigurationError(f"source recording runs on a PC: {told} is missing, get kinect-rig[server]")
     return RecordingSource(settings.recording.path, camera)
 
 

@@ -99,6 +99,13 @@ def test_the_recorded_camera_describes_itself(take: Path) -> None:
     assert told.model.source == "file"
 
 
+def test_a_pi_without_the_libraries_says_so(take: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("importlib.util.find_spec", lambda _name: None)
+    settings = AgentSettings.model_validate({"source": "recording", "camera": 3, "recording": {"path": take}})
+    with pytest.raises(ConfigurationError, match="mcap and numba is missing"):
+        open_source(settings)
+
+
 def test_mistakes_are_named(take: Path) -> None:
     with pytest.raises(ConfigurationError, match=r"no camera 9; it has 3 \(left\), 4 \(right\)"):
         open_take(take, VirtualTime(), 9)

@@ -15,23 +15,26 @@ import numpy as np
 import pytest
 from mcap.reader import make_reader
 
-from rig_protocol.errors import ConfigurationError
+from rig_protocol.errors import ConfigurationError, RigError
 from rig_protocol.frames import EncodedFrame, Payload
 from rig_protocol.recording import MANIFEST, Recording, part_paths
 from rig_protocol.recording_format import DroppedFrames, RecordedSet
 from rig_server import Rig
 from rig_server.config import RecordingSettings, RigSettings, SynchroniserSettings
 from rig_server.metrics import RecordingStatus, RigStatus
+from rig_server.replay import ReplayOptions
 from rig_server.sinks.record import RecordSink
 from rig_server.status_words import alarms, summary
 from rig_server.take_file import TakeFile
 from support.small_agent import BAYER, COLOR, RAW, SmallAgent
+from support.takes import SETTINGS, same_set
 
 KILLED = """
 import sys, time
 from pathlib import Path
 from rig_protocol.frames import EncodedFrame, Payload
 from rig_server.config import RecordingSettings
+from rig_server.replay import ReplayOptions
 from rig_server.sinks.record import RecordSink
 sink = RecordSink(Path(sys.argv[1]), RecordingSettings(), dict, dict)
 sink.start()
@@ -216,6 +219,28 @@ def test_a_live_rig_records_what_came_before_it_gives_the_first_set(tmp_path: Pa
     assert recording.description.camera_ids == (0, 1)
     assert json.loads(recording.attachments["settings.json"])["expected_cameras"] == 2
     assert recording.document(MANIFEST)["received"]["1"]["frames"] > 0
+
+
+def test_a_running_rig_starts_and_ends_recordings_one_after_another(tmp_path: Path) -> None:
+    with Rig.live(SETTINGS) as rig:
+        host, port = rig.place.removeprefix("UDP ").split(":")
+        with SmallAgent(0, (host, int(port))), SmallAgent(1, (host, int(port))):
+            rig.wait_for_cameras(30)
+            assert rig.stop_recording() is None
+            for name in ("a.mcap", "b.mcap"):
+                rig.start_recording(tmp_path / name)
+                with pytest.raises(RigError, match="is being recorded"):
+                    rig.start_recording(tmp_path / "c.mcap")
+                given = [one for _, one in zip(range(15), rig, strict=False)]
+                status = rig.stop_recording()
+                assert status is not None
+                assert status.frames > 0
+                assert rig.status().recording is None
+                assert rig.next_panorama(5.0) is not None  # and is not recorded
+                with Rig.replayed(tmp_path / name, SETTINGS, ReplayOptions(speed=None)) as replayed:
+                    assert same_set(list(replayed)[-1], given[-1])
+    with pytest.raises(RigError, match="no live rig"):
+        Rig.open(tmp_path / "a.mcap", SETTINGS).start_recording(tmp_path / "c.mcap")
 
 
 def test_the_operator_reads_how_the_recording_is_and_why_it_ended() -> None:
