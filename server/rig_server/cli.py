@@ -200,6 +200,8 @@ def run(
         raise ConfigurationError(
             'synchroniser.policy = "latest" repeats frames, which a calibration must not: use "partial"'
         )
+    if calibrate and replay is not None and settings.capture.projector_groups > 1:
+        raise ConfigurationError("projector groups need a live rig: a recording's projectors cannot be told")
     if calibrate:  # what is measured anew is not watched over
         settings = settings.model_copy(update={"watch": WatchSettings()})
     origin = _Origin(simulate, seed, record, replay, _speed(replay_speed), loop, seek or 0.0)

@@ -183,6 +183,10 @@ def test_a_running_server_ends_with_status_0_when_told_to_stop(tmp_path: Path) -
         (("--replay", "a.mcap", "--record", "b.mcap"), "--record has no effect with --replay"),
         (("--replay", "a.mcap", "--replay-speed", "fast"), "write live, max, or a number"),
         (("--replay", "a.mcap", "--replay-speed", "nan"), "write live, max, or a number"),
+        (
+            ("--replay", "a.mcap", "--calibrate", "--projector-groups", "2"),
+            "projector groups need a live rig",
+        ),
         (("--replay", "a.mcap"), "a.mcap cannot be read"),
         (("recover", "a.mcap"), "a.mcap cannot be read"),
     ],
