@@ -9,7 +9,7 @@ from rig_protocol.clock_sync import ClockEstimate
 from rig_protocol.counters import CameraCounters
 from rig_server.durations import Durations
 from rig_server.exposition import families
-from rig_server.metrics import CameraMetrics, DriftReport, RigStatus
+from rig_server.metrics import CameraMetrics, DriftReport, RecordingStatus, RigStatus
 
 PAGE = Path(__file__).parent / "monitoring.md"
 
@@ -62,6 +62,7 @@ def _every_metric() -> RigStatus:
         drift=DriftReport(
             DriftStatus((CameraDrift(0, "in place"),), (PairDrift(0, 1, 0.0, 0.0),)), {0: "cam00", 1: "cam01"}
         ),
+        recording=RecordingStatus(Path("take.mcap")),
         queues=dict.fromkeys(("decoder", "synchroniser", "sets"), 0),
         durations=Durations().snapshot(),
     )

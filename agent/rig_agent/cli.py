@@ -23,6 +23,8 @@ _EXAMPLES = """
 
 `rig-agent --source folder --path recordings/office --camera 3` — play camera 3 of a rig folder
 
+`rig-agent --source recording --path take.mcap --camera 3` — play camera 3 of a recorded take
+
 `rig-agent --source synthetic --camera 0 --seed 7` — one camera of the simulated ring
 
 `rig-agent still board-01.png` — one image for the calibration of a lens
@@ -34,6 +36,8 @@ _EXAMPLES = """
 Every option can also stand in agent.toml or in the environment (RIG_AGENT_SERVER,
 RIG_AGENT_FOLDER__PATH, ...). The command line wins over the environment, the environment over the file.
 """
+
+_PLAYED = ("folder", "recording")  # the sources that play a --path
 
 app = typer.Typer(
     add_completion=False,
@@ -53,7 +57,7 @@ def run(
         str | None,
         typer.Option(
             metavar="NAME",
-            help="freenect (a Kinect), openni2 (another camera), folder (recorded), synthetic (simulated).",
+            help="freenect (a Kinect), openni2 (another camera), folder, recording, synthetic (simulated).",
         ),
     ] = None,
     server: Annotated[
@@ -61,9 +65,11 @@ def run(
     ] = None,
     camera: Annotated[
         str | None,
-        typer.Option(metavar="ID", help="Slot in the ring; with a folder, an id or name of nominal.json."),
+        typer.Option(metavar="ID", help="Slot in the ring; with a folder or recording, an id or name of it."),
     ] = None,
-    path: Annotated[Path | None, typer.Option(help="The rig folder to play (source folder).")] = None,
+    path: Annotated[
+        Path | None, typer.Option(help="What to play: a rig folder (source folder), a take (recording).")
+    ] = None,
     recording: Annotated[
         Path | None, typer.Option(metavar="FILE", help="The .oni recording to play (source openni2).")
     ] = None,
@@ -110,15 +116,17 @@ def run(
         "key_file": key_file,
         "insecure": insecure or None,
         "openni2": {"recording": recording},
-        "folder": {"path": path, "camera": name},
         "synthetic": {"seed": seed, "cameras": cameras},
     }
     settings = load_agent_settings(config, overrides)
+    if settings.source in _PLAYED:
+        played = {settings.source: {"path": path, "camera": name}}
+        settings = load_agent_settings(config, overrides | played)
     _refuse_options_of_another_source(
         settings.source,
         {
             "openni2": {"--recording": recording},
-            "folder": {"--path": path, "--camera NAME": name},
+            "folder": {} if settings.source in _PLAYED else {"--path": path, "--camera NAME": name},
             "synthetic": {"--seed": seed, "--cameras": cameras, "--truth-out": truth_out},
         },
     )

@@ -19,7 +19,7 @@ CONFIG_PLACES = (Path("agent.toml"), Path("/etc/kinect-rig/agent.toml"))
 DEFAULT_PORT = 4012
 AUTO = "auto"
 
-SourceName = Literal["freenect", "openni2", "folder", "synthetic"]
+SourceName = Literal["freenect", "openni2", "folder", "recording", "synthetic"]
 Manner = Literal["lossless", "jpeg", "raw"]
 """How images travel: losslessly compressed, as JPEG, uncompressed."""
 
@@ -31,6 +31,15 @@ class FolderSettings(Settings):
     """Folder that holds nominal.json and one subfolder a camera."""
     camera: int | str | None = Field(None, examples=["cam00"])
     """Camera of the folder, by id or name; unset: the agent's own slot `camera`."""
+
+
+class RecordingSettings(Settings):
+    """A recorded take, one camera of it (docs/recording.md)."""
+
+    path: Path | None = Field(None, examples=[Path("takes/office.mcap")])
+    """The take's first file."""
+    camera: int | str | None = Field(None, examples=["cam00"])
+    """Camera of the take, by id or name; unset: the agent's own slot `camera`."""
 
 
 class PacingSettings(Settings):
@@ -77,6 +86,8 @@ class AgentSettings(Settings):
     """Options of `source = "openni2"`: which device or recording."""
     folder: FolderSettings = FolderSettings()
     """Options of `source = "folder"`."""
+    recording: RecordingSettings = RecordingSettings()
+    """Options of `source = "recording"`."""
     synthetic: SimulatorSettings = SimulatorSettings()
     """Options of `source = "synthetic"`: the simulated rig; `camera` is the one that this agent plays."""
 

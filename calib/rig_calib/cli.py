@@ -43,10 +43,13 @@ app = typer.Typer(
     context_settings={"help_option_names": ["-h", "--help"]},
 )
 
-Folder = Annotated[Path, typer.Argument(help="Rig folder: nominal.json and one subfolder a camera.")]
+Folder = Annotated[
+    Path, typer.Argument(help="Rig folder (nominal.json, one subfolder a camera), or a recording FILE.mcap.")
+]
 Out = Annotated[Path, typer.Option(help="Folder for the results.")]
 Frames = Annotated[
-    int | None, typer.Option(min=1, max=100, help="Panoramic frames to use; default: all, at most 100.")
+    int | None,
+    typer.Option(min=1, max=100, help="Panoramic frames to use; else all (at most 100), 5 of a take."),
 ]
 AsJson = Annotated[bool, typer.Option("--json", help="Print the result as JSON, and nothing else.")]
 
@@ -131,15 +134,14 @@ def fuse(
     out: Out,
     frames: Frames = None,
 ) -> None:
-    """Fuse a rig folder with a calibration into cloud.ply and panorama.png."""
+    """Fuse a rig folder or a recording with a calibration into cloud.ply and panorama.png."""
     from rich.console import Console
 
     from rig_calib.outputs import make_output_folder, write_fused
-    from rig_calib.rig_folder_calibration import read_views
-    from rig_protocol.rig_folder import read_rig_description
+    from rig_calib.rig_folder_calibration import read_description, read_views
 
     known = _load(calibration)
-    views = read_views(folder, read_rig_description(folder), frames)
+    views = read_views(folder, read_description(folder), frames)
     make_output_folder(out)
     fused = write_fused(out, known, views)
     console = Console(highlight=False)
@@ -151,12 +153,12 @@ def fuse(
 @app.command()
 def check(
     calibration: Annotated[Path, typer.Argument(help="The calibration.json of this rig.")],
-    folder: Annotated[Path, typer.Argument(help="Rig folder with frames taken now; no patterns are needed.")],
+    folder: Annotated[Path, typer.Argument(help="Rig folder or recording of now; no patterns are needed.")],
     reference: Annotated[
         Path | None,
         typer.Option(
             metavar="FOLDER",
-            help="Rig folder taken right after calibrating, from the same place: shows far smaller motions.",
+            help="The same of right after calibrating, from the same place: shows far smaller motions.",
         ),
     ] = None,
     frames: Frames = None,
@@ -167,13 +169,12 @@ def check(
 
     from rig_calib.drift.rig_watch import check as compare
     from rig_calib.drift.words import camera_names, drift_table, moved_message, status_dict, unknown_message
-    from rig_calib.rig_folder_calibration import read_panoramas
+    from rig_calib.rig_folder_calibration import read_description, read_panoramas
     from rig_protocol.errors import RigError
-    from rig_protocol.rig_folder import read_rig_description
 
     set_up_logging("WARNING")
-    known, description = _load(calibration), read_rig_description(folder)
-    before = () if reference is None else read_panoramas(reference, read_rig_description(reference))
+    known, description = _load(calibration), read_description(folder)
+    before = () if reference is None else read_panoramas(reference, read_description(reference))
     result = compare(known, description, read_panoramas(folder, description, frames), before)
     names = camera_names(known)
     if as_json:

@@ -3,6 +3,7 @@
 import contextlib
 import json
 from collections.abc import Iterator
+from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -27,6 +28,10 @@ _EXAMPLES = """
 `rig-server` — receive on UDP port 4012 and show the live table until Ctrl-C
 
 `rig-server --watch calibration/calibration.json` — the same, and an alarm when a camera has moved
+
+`rig-server --record take.mcap` — the same, and everything that comes on the disk
+
+`rig-server --replay take.mcap --calibrate` — calibrate on what was recorded
 
 `rig-server --metrics 9100` — the same, and metrics for a Prometheus on this machine
 
@@ -119,6 +124,21 @@ def run(
     out: Annotated[
         Path | None, typer.Option(metavar="DIR", help="Folder for the results; else ./calibration.")
     ] = None,
+    record: Annotated[
+        Path | None,
+        typer.Option(metavar="FILE.mcap", help="Record what comes, as it comes (docs/recording.md)."),
+    ] = None,
+    replay: Annotated[
+        Path | None, typer.Option(metavar="FILE.mcap", help="Take the frames of a recording, not of agents.")
+    ] = None,
+    replay_speed: Annotated[
+        str | None,
+        typer.Option(metavar="live|max|X", help="As fast as recorded, as possible, X times as fast."),
+    ] = None,
+    loop: Annotated[bool, typer.Option("--loop", help="Begin the recording again at its end.")] = False,
+    seek: Annotated[
+        float | None, typer.Option(metavar="S", min=0, help="Leave out the recording's first S seconds.")
+    ] = None,
     watch: Annotated[
         Path | None,
         typer.Option(metavar="CALIBRATION", help="Say when a camera moves from its place in this file."),
@@ -153,6 +173,11 @@ def run(
         seed,
         listen,
     )
+    _refuse_with_replay(
+        replay,
+        {"--simulate": simulate, "--listen": listen, "--record": record, "--insecure": insecure or None},
+        {"--replay-speed": replay_speed, "--loop": loop or None, "--seek": seek},
+    )
     from rig_server.config import WatchSettings, load_rig_settings
 
     if watch is not None and calibrate:
@@ -175,15 +200,18 @@ def run(
         raise ConfigurationError(
             'synchroniser.policy = "latest" repeats frames, which a calibration must not: use "partial"'
         )
+    if calibrate and replay is not None and settings.capture.projector_groups > 1:
+        raise ConfigurationError("projector groups need a live rig: a recording's projectors cannot be told")
     if calibrate:  # what is measured anew is not watched over
         settings = settings.model_copy(update={"watch": WatchSettings()})
+    origin = _Origin(simulate, seed, record, replay, _speed(replay_speed), loop, seek or 0.0)
     console = Console()
     set_up_logging(settings.log_level, console)
     # What takes a second to import comes after everything that can be refused at once.
     if not calibrate:
         from rig_server.receiving import receive
 
-        with _open_rig(settings, simulate, seed) as rig:
+        with _open_rig(settings, origin) as rig:
             receive(rig, console)
         return
     from rig_calib.outputs import known_calibration, make_output_folder
@@ -193,12 +221,29 @@ def run(
     folder = out or Path("calibration")
     known = known_calibration(recalibrate, calibration, folder)
     make_output_folder(folder)
-    with _open_rig(settings, simulate, seed) as rig:
+    with _open_rig(settings, origin) as rig:
         if recalibrate is None or known is None:
             task = CalibrationTask.whole_rig(rig.settings, coach)
         else:
             task = CalibrationTask.one_camera(rig.settings, known, recalibrate, coach)
         calibrate_rig(rig, folder, console, task)
+
+
+@app.command()
+def recover(
+    take: Annotated[Path, typer.Argument(metavar="FILE.mcap", help="The recording's first file.")],
+) -> None:
+    """Mend a recording that was torn by a crash or damaged; what was there is kept as FILE.torn.
+
+    Leaves out what cannot be read. Exit status: 0 it is sound now, 1 it could not be written, 2 no such file.
+    """
+    from rig_protocol.recording import recover as recover_take
+
+    mended = recover_take(take)
+    for part in mended:
+        typer.echo(f"mended {part}; what was there is now {part.name}.torn")
+    if not mended:
+        typer.echo(f"{take} is sound")
 
 
 @app.command()
@@ -289,8 +334,21 @@ def budget(
         raise typer.Exit(EXIT_FAILED)
 
 
+@dataclass(frozen=True, slots=True)
+class _Origin:
+    """Where the frames come from, as the options say; `speed` None: as fast as possible."""
+
+    simulate: int | None
+    seed: int | None
+    record: Path | None
+    replay: Path | None
+    speed: float | None
+    loop: bool
+    seek_s: float
+
+
 @contextlib.contextmanager
-def _open_rig(settings: "RigSettings", simulate: int | None, seed: int | None) -> Iterator["Rig"]:
+def _open_rig(settings: "RigSettings", origin: _Origin) -> Iterator["Rig"]:
     """The rig that the options ask for, not begun yet, and its metrics where settings ask for them."""
     from rig_server.announcement import announced
     from rig_server.metrics_endpoint import metrics_served
@@ -298,12 +356,21 @@ def _open_rig(settings: "RigSettings", simulate: int | None, seed: int | None) -
     from rig_server.operator_socket import operator_served
     from rig_server.rig import Rig
 
-    rig = Rig.live(settings) if simulate is None else Rig.simulated(simulate, seed or 0, settings=settings)
+    if origin.replay is not None:
+        from rig_server.replay import ReplayOptions
+
+        options = ReplayOptions(origin.speed, origin.loop, origin.seek_s)
+        rig = Rig.replayed(origin.replay, settings, options)
+    elif origin.simulate is not None:
+        rig = Rig.simulated(origin.simulate, origin.seed or 0, settings=settings, record=origin.record)
+    else:
+        rig = Rig.live(settings, origin.record)
+    announces = settings.announce and origin.simulate is None and origin.replay is None
     with (
         contextlib.closing(rig),
         metrics_served(settings.metrics_address, rig.status),
         operator_served(settings.control_socket, OperatorRequests(rig)),
-        announced(settings.address) if settings.announce and simulate is None else contextlib.nullcontext(),
+        announced(settings.address) if announces else contextlib.nullcontext(),
     ):
         yield rig
 
@@ -319,6 +386,27 @@ def _refuse_options_without_effect(
         raise ConfigurationError("--seed needs --simulate N")
     if listen is not None and simulate is not None:
         raise ConfigurationError("--listen has no effect with --simulate, which uses a free loopback port")
+
+
+def _refuse_with_replay(replay: Path | None, live: dict[str, Any], of_replay: dict[str, Any]) -> None:
+    """ConfigurationError for an option that a recording, or the lack of one, makes pointless."""
+    for option, value in (of_replay if replay is None else live).items():
+        if value is not None:
+            told = "needs --replay FILE" if replay is None else "has no effect with --replay"
+            raise ConfigurationError(f"{option} {told}")
+
+
+def _speed(text: str | None) -> float | None:
+    """Times the speed of the recording; None for as fast as possible."""
+    if text == "max":
+        return None
+    try:
+        speed = 1.0 if text in (None, "live") else float(text or "")
+    except ValueError:
+        speed = 0.0
+    if not 0.01 <= speed <= 1000:
+        raise ConfigurationError(f"--replay-speed {text}: write live, max, or a number from 0.01 to 1000")
+    return speed
 
 
 add_operator_commands(app)

@@ -123,6 +123,17 @@ class WatchSettings(Settings):
     """It looks at one panoramic frame in so many; a look at twelve cameras takes some 60 ms of one core."""
 
 
+class RecordingSettings(Settings):
+    """How `--record FILE.mcap` records (docs/recording.md)."""
+
+    part_gib: float = Field(16.0, gt=0, le=1024)
+    """Size from which on the recording goes on in another file: FILE.001.mcap, FILE.002.mcap, ..."""
+    keep_free_mib: int = Field(64, ge=0, le=1 << 30)
+    """Room on the disk that a recording leaves: where there is less, it ends in order."""
+    queue_mib: int = Field(256, ge=8, le=1 << 20)
+    """Memory for frames that wait for a slow disk; what does not fit is dropped, and told in the file."""
+
+
 class RigSettings(Settings):
     """Settings of rig-server. Write your own values over the defaults below."""
 
@@ -154,6 +165,7 @@ class RigSettings(Settings):
     capture: CaptureSettings = CaptureSettings()
     calibration: CalibrationSettings = CalibrationSettings()
     watch: WatchSettings = WatchSettings()
+    recording: RecordingSettings = RecordingSettings()
     ring: RingSettings | None = None
     """The drawing of the ring; leave it out when the cameras' places are unknown."""
     cameras: tuple[CameraSettings, ...] = ()

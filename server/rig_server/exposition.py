@@ -8,7 +8,7 @@ from prometheus_client.registry import Collector
 
 from rig_server.durations import SPREAD, STAGES, UNCERTAINTY
 from rig_server.histogram import HistogramSnapshot
-from rig_server.metrics import TEMPERATURE, CameraMetrics, DriftReport, RigStatus
+from rig_server.metrics import TEMPERATURE, CameraMetrics, DriftReport, RecordingStatus, RigStatus
 
 # Fields of CameraCounters that have a metric of their own: its name and what it counts.
 _COUNTERS = {
@@ -71,6 +71,7 @@ def families(status: RigStatus) -> Iterator[Metric]:
     yield from _agents(status.cameras)
     yield from _sets(status)
     yield from _rig(status)
+    yield from _recording(status.recording)
     yield from _drift(status.drift)
 
 
@@ -162,6 +163,21 @@ def _rig(status: RigStatus) -> Iterator[Metric]:
     yield GaugeMetricFamily(
         "rig_receive_buffer_bytes", "How much of the kernel's receive buffer is taken.", status.unread_bytes
     )
+
+
+def _recording(recording: RecordingStatus | None) -> Iterator[Metric]:
+    active = _gauge("rig_recording_active", "1 while a take is being recorded.")
+    frames = _counter("rig_recorded_frames", "Frames that were recorded.")
+    size = _counter("rig_recorded_bytes", "Bytes that were recorded.")
+    dropped = _counter("rig_frames_not_recorded", "Frames that the disk was too slow for.")
+    waiting = _gauge("rig_recording_queue_bytes", "What waits for the disk.")
+    if recording is not None:
+        active.add_metric([], recording.ended is None)
+        frames.add_metric([], recording.frames)
+        size.add_metric([], recording.bytes)
+        dropped.add_metric([], recording.dropped)
+        waiting.add_metric([], recording.waiting_bytes)
+    yield from (active, frames, size, dropped, waiting)
 
 
 def _drift(drift: DriftReport | None) -> Iterator[Metric]:

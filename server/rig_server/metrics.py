@@ -4,6 +4,7 @@ import statistics
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
 
 from rig_calib.drift.watch import DriftStatus
 from rig_protocol.clock_sync import ClockEstimate
@@ -67,6 +68,28 @@ class DriftReport:
 
 
 @dataclass(frozen=True, slots=True)
+class RecordingStatus:
+    """A recording: for how long, what stands in the file, what the disk was too slow for, and the room left.
+
+    `ended` says why it ended before it was stopped.
+    """
+
+    path: Path
+    seconds: float = 0.0
+    frames: int = 0
+    bytes: int = 0
+    dropped: int = 0
+    waiting_bytes: int = 0
+    free_bytes: int = 0
+    ended: str | None = None
+
+    @property
+    def bytes_per_s(self) -> float:
+        """Mean rate since it began."""
+        return self.bytes / self.seconds if self.seconds > 0 else 0.0
+
+
+@dataclass(frozen=True, slots=True)
 class RigStatus:
     """The rig at one moment.
 
@@ -75,7 +98,7 @@ class RigStatus:
     place; `unread_bytes`: how much of the kernel's receive buffer is taken. `durations`: histograms since the
     start, by the names in `rig_server.durations`; `recent`: the same of the last half minute. `link`: what is
     sent and what that takes, in words. `drift`: what the drift watch says, None where nobody watches.
-    `unassigned`: agents that hold the key and have no slot.
+    `unassigned`: agents that hold the key and have no slot. `recording`: None where nobody records.
     `turns`: rises while the receiver is alive, at least once a second.
     """
 
@@ -96,6 +119,7 @@ class RigStatus:
     drift: DriftReport | None = None
     authenticated: bool = False
     unassigned: tuple[UnassignedAgent, ...] = ()
+    recording: RecordingStatus | None = None
     turns: int = 0
 
     @property

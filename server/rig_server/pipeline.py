@@ -7,6 +7,8 @@ import time
 from collections import deque
 from collections.abc import Collection, Mapping
 from dataclasses import replace
+from pathlib import Path
+from typing import Any
 
 from rig_protocol.codecs import COLOR_CODECS, DEPTH_CODECS
 from rig_protocol.errors import RigError
@@ -34,13 +36,15 @@ from rig_server.decoder import FrameDecoder
 from rig_server.description import describe_rig
 from rig_server.durations import Durations
 from rig_server.link_budget import Port
-from rig_server.metrics import RigStatus
+from rig_server.metrics import RecordingStatus, RigStatus
 from rig_server.receiver import Receiver, rig_time_ns
 from rig_server.remote_control import RemoteControl
 from rig_server.rig_status import StatusReader
+from rig_server.sinks.record import RecordSink
 from rig_server.stream_control import StreamControl
 from rig_server.stream_planner import StreamPlanner
 from rig_server.synchroniser import Synchroniser
+from rig_server.take_documents import take_documents
 from rig_server.unassigned import UnassignedAgents
 
 logger = logging.getLogger(__name__)
@@ -58,7 +62,8 @@ class LivePipeline:
     source = "udp"
     ended = False
 
-    def __init__(self, settings: RigSettings, key: RigKey) -> None:
+    def __init__(self, settings: RigSettings, key: RigKey, record: Path | None = None) -> None:
+        """`record`: the file to record to."""
         self._settings = settings
         self._durations = Durations()
         self._assembler = Assembler(_synchroniser(settings), self._durations.set_delivered)
@@ -94,6 +99,9 @@ class LivePipeline:
             self._durations,
             self._streams,
         )
+        self._take = record
+        self._recording = threading.Lock()  # one thread at a time starts or ends a recording
+        self._record: RecordSink | None = None
         self._system_clock = SystemClock(rig_time_ns, time.time_ns)
         self._system_clock_read_ns = 0
         self._presence = threading.Lock()  # guards what follows
@@ -125,13 +133,37 @@ class LivePipeline:
         return describe_rig(self._settings, self.hellos)
 
     def start(self) -> None:
-        """Start receiving."""
+        """Start receiving, and recording before; ConfigurationError where that is not possible."""
+        if self._take is not None:
+            self.start_recording(self._take)
         self._receiver.start()
 
     def stop(self) -> None:
         """Say goodbye to the cameras and end all threads; harmless when already stopped."""
         self._receiver.stop()
         self._decoder.close()
+        self.stop_recording()
+
+    def start_recording(self, take: Path) -> None:
+        """Record to a new file from now on.
+
+        ConfigurationError when it exists or cannot be written, RigError while another recording runs.
+        """
+        with self._recording:
+            if self._record is not None and self._record.status().ended is None:
+                raise RigError(f"{self._record.status().path} is being recorded: stop that first")
+            record = RecordSink(take, self._settings.recording, self._documents, self._camera_counts)
+            record.start()
+            self._record = record
+
+    def stop_recording(self) -> RecordingStatus | None:
+        """End the recording in order; how it was, None where nobody recorded."""
+        with self._recording:
+            record, self._record = self._record, None
+            if record is None:
+                return None
+            record.stop()
+            return record.status()
 
     def absence(self) -> str | None:
         """Which expected cameras are not here and what to do, or None; RigError when receiving has failed."""
@@ -145,13 +177,19 @@ class LivePipeline:
     def next_panorama(self, timeout_s: float) -> PanoramicFrame | None:
         """The next set, or None when none came within `timeout_s`; RigError when receiving has failed."""
         self._check_receiver()
-        return self._assembler.next_panorama(timeout_s)
+        panorama = self._assembler.next_panorama(timeout_s)
+        record = self._record
+        if panorama is not None and record is not None:
+            record.add_set(panorama)
+        return panorama
 
     def status(self) -> RigStatus:
         """The rig at this moment; any thread may ask."""
         with self._presence:
             unassigned = self._unassigned.here(rig_time_ns())
-        return replace(self._status.read(self.hellos), unassigned=unassigned)
+        record = self._record
+        recording = None if record is None else record.status()
+        return replace(self._status.read(self.hellos), unassigned=unassigned, recording=recording)
 
     def control(
         self, cameras: int | Collection[int] | None, name: str, value: ControlValue
@@ -189,6 +227,9 @@ class LivePipeline:
         self._streams.take(event, rig_time_ns())
         match event:
             case FrameReceived(frame):
+                record = self._record  # others end it
+                if record is not None:
+                    record.add_frame(frame)
                 self._decoder.submit(frame)
             case CameraJoined(camera_id, hello, address):
                 self._assembler.camera_joined(camera_id, hello.fps)
@@ -212,6 +253,18 @@ class LivePipeline:
                     self._unassigned.take(event, rig_time_ns())
                 level = logging.DEBUG if told else logging.WARNING
                 logger.log(level, "refused %s: %s", address[0], text, extra=see(Topic.AGENT_REFUSED))
+
+    def _documents(self) -> Mapping[str, Any]:
+        """What a recording tells of the rig, as it is now."""
+        return take_documents(self._settings, self.description, self.hellos)
+
+    def _camera_counts(self) -> Mapping[str, Mapping[str, int]]:
+        """What came of every camera, and what was lost on the way."""
+        known = dict(self._link.cameras)
+        return {
+            str(camera_id): {"frames": camera.counters.frames, "lost": camera.counters.lost}
+            for camera_id, camera in sorted(known.items())
+        }
 
     def _on_turn(self, now_ns: int) -> None:
         """On the receiver's thread, after every wake-up."""

@@ -14,7 +14,7 @@ _UPDATE_S = 0.5
 
 
 def receive(rig: Rig, console: Console) -> None:
-    """Show the live table until Ctrl-C or SIGTERM, the ordinary end.
+    """Show the live table until Ctrl-C or SIGTERM, the ordinary end, or that of what is replayed.
 
     systemd's watchdog is fed only while both go on: the receiver's turns, and the taking of sets here.
     """
@@ -28,7 +28,8 @@ def receive(rig: Rig, console: Console) -> None:
         at_the_end.callback(service_manager.notify, "STOPPING=1")
         service_manager.notify("READY=1")
         turns, next_update_s = 0, time.monotonic()
-        while True:
+        at_the_end.callback(_tell_end, rig, console)
+        while not rig.ended:
             rig.next_panorama(_UPDATE_S)
             if time.monotonic() < next_update_s:
                 continue
@@ -38,3 +39,14 @@ def receive(rig: Rig, console: Console) -> None:
             if status.turns != turns:
                 turns = status.turns
                 service_manager.feed_watchdog(time.monotonic_ns())
+
+
+def _tell_end(rig: Rig, console: Console) -> None:
+    """The totals of what was replayed to its end."""
+    if rig.ended:
+        status = rig.status()
+        console.print(
+            f"{rig.place} has ended: {status.complete} complete, {status.partial} partial sets",
+            soft_wrap=True,
+            markup=False,
+        )

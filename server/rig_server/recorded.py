@@ -83,6 +83,13 @@ class RecordedRig:
         """A recording's cameras are what they are: RigError."""
         raise RigError(f"{self.place} is a recording: slot {slot.camera_id} cannot be given away")
 
+    def start_recording(self, take: Path) -> None:
+        """What was captured already is not recorded again: RigError."""
+        raise RigError(f"{self.place} is a recording: copy it instead of recording {take}")
+
+    def stop_recording(self) -> None:
+        """Nobody records."""
+
     def status(self) -> RigStatus:
         """Cameras and sets read so far; a recording has no rates."""
         cameras = (CameraMetrics(c.id, c.name, connected=True) for c in self.description.cameras)

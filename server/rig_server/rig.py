@@ -21,9 +21,10 @@ from rig_protocol.rig_key import RigKey
 from rig_protocol.roster import Slot
 from rig_protocol.troubleshooting import Topic
 from rig_server.config import MAX_CAMERAS, RigSettings, load_rig_settings, parse_address
-from rig_server.metrics import RigStatus
+from rig_server.metrics import RecordingStatus, RigStatus
 from rig_server.pipeline import LivePipeline
 from rig_server.recorded import RecordedRig
+from rig_server.replay import ReplayedRig, ReplayOptions
 from rig_server.simulation import SIMULATED_FPS, Simulation, simulated_settings
 from rig_server.sinks.watch import WatchSink
 
@@ -36,7 +37,7 @@ class Feed(Protocol):
 
     @property
     def source(self) -> str:
-        """`udp` or `folder`, for the provenance of a result."""
+        """`udp`, `folder` or `recording`, for the provenance of a result."""
         ...
 
     @property
@@ -85,6 +86,14 @@ class Feed(Protocol):
         """Give a slot to a camera."""
         ...
 
+    def start_recording(self, take: Path) -> None:
+        """Record to a new file from now on."""
+        ...
+
+    def stop_recording(self) -> RecordingStatus | None:
+        """End the recording in order; how it was."""
+        ...
+
     def status(self) -> RigStatus:
         """The rig at this moment."""
         ...
@@ -104,12 +113,14 @@ class Rig:
 
     @classmethod
     def open(cls, source: str | Path, settings: RigSettings | None = None) -> Self:
-        """A rig from `udp://HOST:PORT` (listen there), `simulated:N`, or the path of a rig folder.
+        """A rig from `udp://HOST:PORT` (listen there), `simulated:N`, a rig folder, or a recording FILE.mcap.
 
         Settings: None reads rig.toml as `rig-server` does. ConfigurationError when the source makes no sense.
         """
         settings = settings or load_rig_settings(None)
         match = _LIVE_SOURCE.fullmatch(str(source))
+        if match is None and Path(source).suffix == ".mcap":
+            return cls.replayed(Path(source), settings)
         if match is None:
             return cls(RecordedRig(Path(source)), settings)
         kind, rest = match.groups()
@@ -120,9 +131,20 @@ class Rig:
         return cls.simulated(int(rest), settings=settings)
 
     @classmethod
-    def live(cls, settings: RigSettings) -> Self:
-        """The agents that stream to this machine, at the address that the settings state."""
-        return cls(LivePipeline(settings, rig_key(settings.key_file, settings.insecure)), settings)
+    def live(cls, settings: RigSettings, record: Path | None = None) -> Self:
+        """The agents that stream to this machine, at the address that the settings state.
+
+        `record`: a new file to record the take to (docs/recording.md).
+        """
+        return cls(LivePipeline(settings, rig_key(settings.key_file, settings.insecure), record), settings)
+
+    @classmethod
+    def replayed(cls, take: Path, settings: RigSettings, options: ReplayOptions | None = None) -> Self:
+        """A recorded take; the default options play it once, at the speed at which it was recorded.
+
+        ConfigurationError when there is no such file, DataError when it is no recording.
+        """
+        return cls(ReplayedRig(take, settings, options or ReplayOptions()), settings)
 
     @classmethod
     def simulated(
@@ -131,11 +153,12 @@ class Rig:
         seed: int = 0,
         fps: float = SIMULATED_FPS,
         settings: RigSettings | None = None,
+        record: Path | None = None,
     ) -> Self:
         """A ring of simulated agents: processes of this machine that stream over loopback UDP."""
         settings = simulated_settings(settings or load_rig_settings(None), cameras)
         key = RigKey.generate(secrets.token_bytes)
-        pipeline = LivePipeline(settings, key)
+        pipeline = LivePipeline(settings, key, record)
         return cls(pipeline, settings, Simulation(cameras, seed, fps, pipeline.address, key))
 
     def __enter__(self) -> Self:
@@ -214,6 +237,18 @@ class Rig:
         """Give a slot to a camera, until the rig ends (`rig-server assign` writes rig.toml, too)."""
         self._feed.assign(slot)
 
+    def start_recording(self, take: Path) -> None:
+        """Record to a new file from now on; any thread may ask.
+
+        ConfigurationError when it exists or cannot be written; RigError while another recording runs, and
+        for a rig that is no live one.
+        """
+        self._feed.start_recording(take)
+
+    def stop_recording(self) -> RecordingStatus | None:
+        """End the recording in order and say how it was; None where nobody recorded."""
+        return self._feed.stop_recording()
+
     @property
     def description(self) -> RigDescription:
         """The cameras that have come so far, their models, and nominal poses where the drawing is known."""
@@ -221,7 +256,7 @@ class Rig:
 
     @property
     def source(self) -> str:
-        """`udp` or `folder`."""
+        """`udp`, `folder` or `recording`."""
         return self._feed.source
 
     @property
@@ -231,7 +266,7 @@ class Rig:
 
     @property
     def hellos(self) -> Mapping[int, Hello]:
-        """What the agents said of themselves, by camera id; empty for a recording."""
+        """What the agents said of themselves, by camera id; empty for a rig folder."""
         return self._feed.hellos
 
     @property

@@ -10,7 +10,7 @@ from rig_server.durations import (
     UNCERTAINTY,
 )
 from rig_server.histogram import HistogramSnapshot
-from rig_server.metrics import RigStatus
+from rig_server.metrics import RecordingStatus, RigStatus
 
 _STAGES = {
     EXPOSURE_TO_RECEIVED: "arrival",
@@ -27,12 +27,15 @@ def summary(status: RigStatus) -> tuple[list[str], list[str]]:
         figures.append(latency)
     if status.link is not None:
         figures.append(status.link)
+    if status.recording is not None and status.recording.ended is None:
+        figures.append(_recording(status.recording))
     names = {camera.camera_id: camera.name for camera in status.cameras}
     missing = [names.get(camera_id, str(camera_id)) for camera_id in status.often_missing]
     troubles = {
         "often missing": ", ".join(missing),
         "waiting": _waiting(status),
         "dropped": _counts(status.dropped),
+        "frames not recorded": "" if status.recording is None else str(status.recording.dropped or ""),
         "without a slot (rig-server assign)": ", ".join(map(str, status.unassigned)),
         "rejected datagrams": _counts(status.rejected, _MOST_CAUSES),
     }
@@ -41,12 +44,29 @@ def summary(status: RigStatus) -> tuple[list[str], list[str]]:
 
 def alarms(status: RigStatus) -> list[str]:
     """What must not be overlooked: cameras that moved, and a drift watch that has ended."""
+    told = []
+    if status.recording is not None and status.recording.ended is not None:
+        told.append(f"recording {status.recording.path} ended: {status.recording.ended}")
     if status.drift is None:
-        return []
-    told = [moved_message(camera, status.drift.names) for camera in status.drift.status.moved]
+        return told
+    told += [moved_message(camera, status.drift.names) for camera in status.drift.status.moved]
     if status.drift.failure is not None:
         told.append(f"the drift watch has ended: {status.drift.failure}; start the server again")
     return told
+
+
+def _recording(recording: RecordingStatus) -> str:
+    """How long, how much, and for how long the disk has room at this rate."""
+    rate = recording.bytes_per_s
+    known = recording.seconds >= 2 and rate > 0  # before, the rate is that of the file's head
+    left = f", room for {_duration(max(recording.free_bytes, 0) / rate)}" if known else ""
+    size = f"{recording.bytes / 1e9:.2f} GB, {rate / 1e6:.0f} MB/s"
+    return f"recording {recording.path.name}: {_duration(recording.seconds)}, {size}{left}"
+
+
+def _duration(seconds: float) -> str:
+    minutes, rest = divmod(int(seconds), 60)
+    return f"{minutes}:{rest:02d}" if minutes < 60 else f"{minutes // 60} h {minutes % 60:02d} min"
 
 
 def _sets(status: RigStatus) -> str:

@@ -1,6 +1,7 @@
 """A rig's status in which every figure is there and no two are alike."""
 
 from dataclasses import asdict, fields
+from pathlib import Path
 
 from rig_calib.drift.watch import CameraDrift, DriftStatus, PairDrift
 from rig_protocol.clock_sync import ClockEstimate
@@ -8,7 +9,7 @@ from rig_protocol.counters import CameraCounters
 from rig_protocol.frames import RgbdFrame
 from rig_server.assembler import SetRecord
 from rig_server.durations import Durations
-from rig_server.metrics import CameraMetrics, DriftReport, RigStatus
+from rig_server.metrics import CameraMetrics, DriftReport, RecordingStatus, RigStatus
 
 MS = 1_000_000
 
@@ -74,5 +75,6 @@ def full_status() -> RigStatus:
         durations=durations,
         recent=durations,
         drift=DriftReport(full_drift(), {0: "cam00", 1: "cam01"}, passed_over=41),
+        recording=RecordingStatus(Path("takes/a.mcap"), 62.0, 1860, 3_100_000_000, 43, 44, 10**12),
         link="12 cameras at 30 fps need 72.1 MB/s, 60% of the link",
     )

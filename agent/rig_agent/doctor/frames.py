@@ -34,7 +34,7 @@ def frames(machine: Machine, settings: AgentSettings) -> tuple[Finding, SourceDe
 
 def _read(source: FrameSource, name: str) -> Finding:
     """One frame of a source that makes them, a second's frames of a device."""
-    wanted = 1 if name in ("folder", "synthetic") else _LIVE_FRAMES
+    wanted = 1 if name in ("folder", "recording", "synthetic") else _LIVE_FRAMES
     whole = damaged = 0
     end_s = time.monotonic() + _FIRST_FRAME_S
     while whole + damaged < wanted and time.monotonic() < end_s:
@@ -44,7 +44,7 @@ def _read(source: FrameSource, name: str) -> Finding:
             whole += not frame.damaged
     if whole + damaged < wanted:
         text = f"only {whole + damaged} of {wanted} frames came within {_FIRST_FRAME_S:.0f} s"
-        return failed(Check.FRAMES, text, None, Topic.NO_FRAMES, hardware=name != "folder")
+        return failed(Check.FRAMES, text, None, Topic.NO_FRAMES, hardware=name not in ("folder", "recording"))
     if damaged > _MANY_DAMAGED * wanted:
         return warning(
             Check.FRAMES,

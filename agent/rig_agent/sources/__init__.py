@@ -1,5 +1,6 @@
 """The drivers of cameras, by name. A driver and its libraries are imported when it is opened."""
 
+import importlib.util
 from typing import TYPE_CHECKING
 
 from rig_protocol.errors import ConfigurationError
@@ -39,6 +40,23 @@ def _open_folder(settings: "AgentSettings") -> "FrameSource":
     return FolderSource(settings.folder.path, camera, settings.fps or _FOLDER_FPS)
 
 
+def _open_recording(settings: "AgentSettings") -> "FrameSource":
+    from rig_agent.sources.recording import RecordingSource
+
+    camera = settings.camera if settings.recording.camera is None else settings.recording.camera
+    if settings.recording.path is None:
+        raise ConfigurationError("source recording needs a file: give --path, or `path` in [recording]")
+    if camera is None:
+        raise ConfigurationError(
+            "source recording plays one camera: give --camera (or `camera` in [recording])"
+        )
+    missing = [name for name in ("mcap", "numba") if importlib.util.find_spec(name) is None]
+    if missing:
+        told = " and ".join(missing)
+        raise ConfigurationError(f"source recording runs on a PC: {told} is missing, get kinect-rig[server]")
+    return RecordingSource(settings.recording.path, camera)
+
+
 def _open_synthetic(settings: "AgentSettings") -> "FrameSource":
     from rig_agent.sources.synthetic import SyntheticSource
 
@@ -50,5 +68,6 @@ _OPENERS = {
     "freenect": _open_freenect,
     "openni2": _open_openni2,
     "folder": _open_folder,
+    "recording": _open_recording,
     "synthetic": _open_synthetic,
 }

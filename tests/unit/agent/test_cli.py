@@ -81,7 +81,10 @@ def test_a_folders_camera_may_be_named(streamed: list[AgentSettings]) -> None:
         (("--recording", "a.oni"), r"--recording belongs to --source openni2"),
         (("--path", "rig"), r"--path belongs to --source folder"),
         (("--camera", "left"), r"--camera NAME belongs to --source folder"),
-        (("--source", "kinect"), r"`source`: Input should be 'freenect', 'openni2', 'folder' or 'synthetic'"),
+        (
+            ("--source", "kinect"),
+            r"`source`: Input should be 'freenect', .*'recording' or 'synthetic'",
+        ),
     ],
 )
 def test_an_option_that_would_be_ignored_is_refused(words: tuple[str, ...], message: str) -> None:

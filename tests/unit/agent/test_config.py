@@ -50,7 +50,7 @@ def test_a_file_that_was_asked_for_must_exist() -> None:
         ("[frenect]\nserial = 'x'", r"unknown key `frenect`; did you mean `freenect`\?"),
         (
             'source = "kinect"',
-            r"`source`: Input should be 'freenect', 'openni2', 'folder' or 'synthetic' \(got 'kinect'\)",
+            r"`source`: Input should be 'freenect', 'openni2', .*'recording' or 'synthetic' \(got 'kinect'\)",
         ),
         ('server = "pc:http"', r"`server`: .*'pc:http' is not HOST or HOST:PORT"),
         ('server = ":4012"', r"`server`: .*is not HOST or HOST:PORT"),

@@ -14,6 +14,7 @@ import pytest
 from rig_protocol.key_file import read_key
 from rig_server.cli import main
 from rig_server.config import RigSettings, load_rig_settings
+from support.takes import record_take
 
 Program = Callable[..., int]
 
@@ -171,3 +172,40 @@ def test_a_running_server_ends_with_status_0_when_told_to_stop(tmp_path: Path) -
         assert "0/0 cameras" in server.stdout.readline()
         server.terminate()
         assert server.wait(timeout=20) == 0
+
+
+@pytest.mark.parametrize(
+    ("words", "told"),
+    [
+        (("--seek", "3"), "--seek needs --replay FILE"),
+        (("--loop",), "--loop needs --replay FILE"),
+        (("--replay", "a.mcap", "--simulate", "2"), "--simulate has no effect with --replay"),
+        (("--replay", "a.mcap", "--record", "b.mcap"), "--record has no effect with --replay"),
+        (("--replay", "a.mcap", "--replay-speed", "fast"), "write live, max, or a number"),
+        (("--replay", "a.mcap", "--replay-speed", "nan"), "write live, max, or a number"),
+        (
+            ("--replay", "a.mcap", "--calibrate", "--projector-groups", "2"),
+            "projector groups need a live rig",
+        ),
+        (("--replay", "a.mcap"), "a.mcap cannot be read"),
+        (("recover", "a.mcap"), "a.mcap cannot be read"),
+    ],
+)
+def test_options_of_replay_that_make_no_sense_end_with_status_2(
+    rig_server: Program, capsys: pytest.CaptureFixture[str], words: tuple[str, ...], told: str
+) -> None:
+    assert rig_server(*words) == 2
+    assert told in capsys.readouterr().err
+
+
+def test_a_torn_take_is_recovered_and_played_by_the_program(
+    rig_server: Program, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    record_take(tmp_path / "whole.mcap", sets=5)
+    (tmp_path / "take.mcap").write_bytes((tmp_path / "whole.mcap").read_bytes()[:-100])
+    assert rig_server("recover", "take.mcap") == 0
+    assert "mended take.mcap; what was there is now take.mcap.torn" in capsys.readouterr().out
+    assert rig_server("recover", "take.mcap") == 0
+    assert "take.mcap is sound" in capsys.readouterr().out
+    assert rig_server("--replay", "take.mcap", "--replay-speed", "max") == 0
+    assert "recording take.mcap has ended: 5 complete, 0 partial sets" in capsys.readouterr().out

@@ -19,6 +19,7 @@ class TurningRig:
     """A rig without cameras whose receiver has made so many turns at each look; then Ctrl-C."""
 
     place = "UDP 127.0.0.1:0"
+    ended = False
 
     def __init__(self, turns: Iterable[int]) -> None:
         self._turns = iter(turns)

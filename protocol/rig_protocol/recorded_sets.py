@@ -1,0 +1,40 @@
+"""The sets of a recording put together again: which frames went out as one panoramic frame."""
+
+from collections import deque
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass
+
+from rig_protocol.frames import EncodedFrame
+from rig_protocol.recording_format import Entry, RecordedSet
+
+# Frames of a camera that a set may still ask for: those that waited in the synchroniser (8) and in sets that
+# nobody had taken (4), and as many again.
+_REMEMBERED = 24
+
+
+@dataclass(frozen=True, slots=True)
+class EncodedSet:
+    """A set whose frames are still as they came; None where it has none, or the file lacks it."""
+
+    index: int
+    time_ns: int
+    frames: Mapping[int, EncodedFrame | None]
+
+
+def with_frames(entries: Iterable[Entry], from_ns: int = 0) -> Iterator[EncodedSet]:
+    """The sets that went out from a time on, with their frames; one that has no frame is left out."""
+    came: dict[int, deque[EncodedFrame]] = {}
+    for entry in entries:
+        if isinstance(entry, EncodedFrame):
+            came.setdefault(entry.camera_id, deque(maxlen=_REMEMBERED)).append(entry)
+        elif isinstance(entry, RecordedSet) and entry.taken_ns >= from_ns:
+            frames = {
+                camera_id: _stamped(came.get(camera_id, ()), time_ns)
+                for camera_id, time_ns in entry.timestamps_ns.items()
+            }
+            if any(frames.values()):
+                yield EncodedSet(entry.index, entry.taken_ns, frames)
+
+
+def _stamped(came: Iterable[EncodedFrame], time_ns: int | None) -> EncodedFrame | None:
+    return next((frame for frame in came if frame.timestamp_ns == time_ns), None)
