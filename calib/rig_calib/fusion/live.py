@@ -229,8 +229,8 @@ class LiveFusion:
             self._measured.weight[k] = 0
             return
         scratch, sums = self._scratches.get()
-        q, weight = self._measured.inverse[k], self._measured.weight[k]
-        clean_depth(images.depth, images.in_mm, self._lenses[k], scratch, q, weight)
+        inverse_m, weight = self._measured.inverse[k], self._measured.weight[k]
+        clean_depth(images.depth, images.in_mm, self._lenses[k], self._ring.scales[k], scratch, inverse_m, weight)
         self._scratches.put((scratch, sums))
 
     def _place(self, k: int, images: "_Images | None") -> None:
@@ -273,7 +273,8 @@ def _scratch(shape: tuple[int, int]) -> Scratch:
         solid=np.zeros(shape, np.uint8),
         eroded=np.zeros(shape, np.uint8),
         columns=np.zeros(shape[1], np.int16),
-        rows=np.zeros((9, shape[1]), np.float32),
+        rows=np.zeros((16, shape[1]), np.float32),
+        addresses=np.zeros((6, shape[1]), np.int32),
     )
 
 

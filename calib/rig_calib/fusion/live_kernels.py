@@ -1,8 +1,8 @@
 """Loops of the live fusion, compiled: clean depth, place and colour points, blend the panorama.
 
-All work in single precision on planes of the depth image, row by row, and allocate nothing. Depth is kept
-as q = numerator / z = offset − disparity, in raw steps, where noise is the same at every distance and planes
-are linear in the image.
+All work in single precision, row by row, and allocate nothing; loops over a row have no branches where the
+compiler can so make vector instructions of them. Depth is cleaned as q = numerator / z = offset − disparity,
+in raw steps, where noise is the same at every distance and planes are linear in the image.
 """
 
 from typing import NamedTuple
@@ -17,6 +17,7 @@ Array32 = npt.NDArray[np.float32]
 U8 = npt.NDArray[np.uint8]
 U16 = npt.NDArray[np.uint16]
 U64 = npt.NDArray[np.uint64]
+I32 = npt.NDArray[np.int32]
 
 BAYER, BGR, GREY = 0, 1, 2
 EMPTY = np.uint64(0xFFFF_FFFF_FFFF_FFFF)
@@ -30,6 +31,9 @@ _COS2_STEEPEST = F32(np.cos(np.deg2rad(80.0)) ** 2)
 _REACH, _LEAST_AROUND = 4, 20  # of the 9×9 pixels around a point, so many must lie on a surface
 _SAME_SURFACE_M, _SAME_SURFACE_RATIO = F32(0.03), F32(0.03)  # within it two cameras measure one thing
 _FRONT_RATIO = F32(1.05)  # what is farther than this times the nearest of a panorama pixel is behind it
+_UNITS_A_METRE = F32(1e5)  # of a distance in the windows
+_WIDEST = F32(4.0)  # squared tangent: beyond it no camera looks, and a lens polynomial may fold back
+_BIT = np.uint64(1)
 _SHARE = F32(1.8)  # makes the weight of a camera that looks straight at a surface fill a byte
 _ZERO, _HALF, _ONE, _TWO = F32(0.0), F32(0.5), F32(1.0), F32(2.0)
 _PI, _HALF_PI, _TURN = F32(np.pi), F32(np.pi / 2), F32(2 * np.pi)
@@ -56,25 +60,33 @@ class Scratch(NamedTuple):
     solid: U8  # (H,W)
     eroded: U8  # (H,W)
     columns: npt.NDArray[np.int16]  # (W,)
-    rows: Array32  # (9,W)
+    rows: Array32  # (16,W), see below
+    addresses: I32  # (6,W), see below
+
+
+# Rows of `Scratch.rows` ...
+_X, _Y, _Z, _U, _V, _OWNED, _DISTANCE, _COLUMN, _ROW = range(9)
+_TOTAL, _DX, _DY, _DZ, _DEPTH, _INVERSE, _WEIGHT = range(9, 16)
+# ... and of `Scratch.addresses`: a partner's pixel or a cell of the window, −1 for none; colour pixel.
+_PLACE, _AT_U, _AT_V, _UNITS, _PART, _KEPT = range(6)
 
 
 class Ring(NamedTuple):
     """Tables of all C cameras; poses (C,3,4) f32, intrinsics (C,9): fx, fy, cx, cy, k1, k2, p1, p2, k3.
 
-    `rays`: a pixel's ray in the rig frame, times numerator and depth correction: the point is
-    origin + ray / q. `color_pixels`: its place in the colour image, (u, v) + q · (du, dv).
-    `partners` (C,K): cameras that share a view, −1 for none; `shared` has bit k where partner k may see
-    what a pixel sees.
+    `scales`: corrected 1/z by q. `rays`: a pixel's ray in the rig frame: the point is origin + ray · z.
+    `color_pixels`: its place in the colour image, (u, v) + (du, dv) / z. `partners` (C,K): cameras that
+    share a view, −1 for none; `spans`: columns from and to which partner k may see what a row sees.
     """
 
+    scales: Array32  # (C,H,W)
     rays: Array32  # (C,3,H,W)
     origins: Array32  # (C,3)
     color_pixels: Array32  # (C,4,H,W)
     T_grid_rig: Array32  # (C,3,4)
     lenses: Array32  # (C,9)
     partners: npt.NDArray[np.int64]  # (C,K)
-    shared: U8  # (C,H,W)
+    spans: npt.NDArray[np.int64]  # (C,K,H,2)
 
 
 class Drum(NamedTuple):
@@ -90,15 +102,19 @@ class Drum(NamedTuple):
 
 
 class Measured(NamedTuple):
-    """Cleaned depth of all cameras: q (C,H,W), and its weight 1/σ² up to a factor, 0 for none."""
+    """Cleaned depth of all cameras: 1/z (C,H,W), 1/m, and its weight 1/σ² up to a factor, 0 for none."""
 
     inverse: Array32
     weight: Array32
 
 
 @compiled()
-def clean_depth(image: U16, in_mm: bool, lens: Lens, scratch: Scratch, q: Array32, weight: Array32) -> None:
-    """Smoothed q (H,W) of one depth image and its weight, zero for what lies on no surface.
+def clean_depth(
+    image: U16, in_mm: bool, lens: Lens, scale: Array32, scratch: Scratch, inverse: Array32, weight: Array32
+) -> None:
+    """Smoothed 1/z (H,W) of one depth image and its weight, zero for what lies on no surface.
+
+    `scale` (H,W) makes 1/z of q.
 
     Flying pixels sit beside edges and holes or are steep; what interference leaves are small islands.
     """
@@ -120,9 +136,9 @@ def clean_depth(image: U16, in_mm: bool, lens: Lens, scratch: Scratch, q: Array3
         if y > _REACH:
             _subtract_row(scratch.columns, scratch.eroded[y - _REACH - 1])
         if 0 < y < height - 1:
-            _keep_smooth(scratch, y, q[y], weight[y])
+            _keep_smooth(scratch, y, scale[y], inverse[y], weight[y])
         else:
-            q[y], weight[y] = _NONE, _ZERO
+            inverse[y], weight[y] = _ONE, _ZERO
 
 
 @inlined
@@ -188,7 +204,7 @@ def _subtract_row(columns: npt.NDArray[np.int16], row: U8) -> None:
 
 
 @inlined
-def _keep_smooth(scratch: Scratch, y: int, q: Array32, weight: Array32) -> None:
+def _keep_smooth(scratch: Scratch, y: int, scale: Array32, inverse: Array32, weight: Array32) -> None:
     """The mean of 3×3 pixels of a surface, which does not bend a plane; small islands lose their weight."""
     above, row, below = scratch.inverse[y - 1], scratch.inverse[y], scratch.inverse[y + 1]
     eroded, likely, columns = scratch.eroded[y], scratch.likely[y], scratch.columns
@@ -196,7 +212,7 @@ def _keep_smooth(scratch: Scratch, y: int, q: Array32, weight: Array32) -> None:
     around = 0
     for x in range(min(_REACH, width)):
         around += columns[x]
-    q[0], q[width - 1], weight[0], weight[width - 1] = _NONE, _NONE, _ZERO, _ZERO
+    inverse[0], inverse[width - 1], weight[0], weight[width - 1] = _ONE, _ONE, _ZERO, _ZERO
     counts = scratch.rows[0]
     for x in range(width):
         if x + _REACH < width:
@@ -208,7 +224,7 @@ def _keep_smooth(scratch: Scratch, y: int, q: Array32, weight: Array32) -> None:
         total = above[x - 1] + above[x] + above[x + 1] + row[x - 1] + row[x] + row[x + 1]
         total += below[x - 1] + below[x] + below[x + 1]
         kept = (eroded[x] != 0) & (counts[x] >= F32(_LEAST_AROUND))
-        q[x] = total * F32(1 / 9) if kept else _NONE
+        inverse[x] = total * F32(1 / 9) * scale[x] if kept else _ONE
         weight[x] = likely[x] if kept else _ZERO
 
 
@@ -232,108 +248,170 @@ def place_points(
     camera with the larger weight owns it. `image` (h,w) is Bayer (GRBG), grey, or (h, 3·w) BGR; `gains`
     (3,256) maps R, G, B; `scan` says in which direction along the row the colour camera looks past edges.
     """
-    cells = drum.cells[camera]
-    for row in range(cells.shape[0]):
-        cells[row] = EMPTY
-    height = measured.inverse.shape[1]
+    cells = drum.cells[camera].reshape(-1)
+    cells[:] = EMPTY
+    height, wide = measured.inverse.shape[1], image.shape[1] // 3 if kind == BGR else image.shape[1]
+    rows, addresses = scratch.rows, scratch.addresses
     count = 0
     for y in range(height):
-        _place_row(camera, y, measured, ring, scratch.rows)
-        _merge_row(camera, y, measured, ring, scratch.rows)
-        _project_row(drum, scratch.rows)
-        count = _paint_row(
-            camera, y, measured.weight, drum, image, kind, gains, scan, scratch.rows, points, colors, count
-        )
+        _place_row(camera, y, measured, ring, rows)
+        _merge_row(camera, y, measured, ring, rows, addresses[_PLACE])
+        _project_row(drum, rows)
+        _address_row(camera, drum, measured.weight[camera, y], wide, image.shape[0], kind, rows, addresses)
+        kept = _unhidden(rows[_U], scan, addresses)
+        for k in range(kept):
+            x = addresses[_KEPT, k]
+            red, green, blue = _color(image, kind, addresses[_AT_U, x], addresses[_AT_V, x])
+            red, green, blue = gains[0, red], gains[1, green], gains[2, blue]
+            points[count, 0], points[count, 1], points[count, 2] = rows[_X, x], rows[_Y, x], rows[_Z, x]
+            colors[count, 0], colors[count, 1], colors[count, 2] = red, green, blue
+            count += int(rows[_OWNED, x])
+            _draw(cells, addresses, x, red, green, blue)
     return count
 
 
 @inlined
 def _place_row(camera: int, y: int, measured: Measured, ring: Ring, rows: Array32) -> None:
-    """Points in the rig frame (rows 0–2), their colour pixels (3, 4), and that they are owned (5)."""
-    q = measured.inverse[camera, y]
+    """Points in the rig frame, their colour pixels, and that they are owned."""
+    inverse = measured.inverse[camera, y]
     rays_x, rays_y, rays_z = ring.rays[camera, 0, y], ring.rays[camera, 1, y], ring.rays[camera, 2, y]
     u, v = ring.color_pixels[camera, 0, y], ring.color_pixels[camera, 1, y]
     du, dv = ring.color_pixels[camera, 2, y], ring.color_pixels[camera, 3, y]
     x0, y0, z0 = ring.origins[camera, 0], ring.origins[camera, 1], ring.origins[camera, 2]
-    for x in range(q.size):
-        inverse = _ONE / q[x]
-        rows[0, x] = x0 + rays_x[x] * inverse
-        rows[1, x] = y0 + rays_y[x] * inverse
-        rows[2, x] = z0 + rays_z[x] * inverse
-        rows[3, x] = u[x] + du[x] * q[x]
-        rows[4, x] = v[x] + dv[x] * q[x]
-        rows[5, x] = _ONE
+    for x in range(inverse.size):
+        depth = _ONE / inverse[x]
+        rows[_X, x] = x0 + rays_x[x] * depth
+        rows[_Y, x] = y0 + rays_y[x] * depth
+        rows[_Z, x] = z0 + rays_z[x] * depth
+        rows[_U, x] = u[x] + du[x] * inverse[x]
+        rows[_V, x] = v[x] + dv[x] * inverse[x]
+        rows[_OWNED, x] = _ONE
 
 
 @inlined
-def _merge_row(camera: int, y: int, measured: Measured, ring: Ring, rows: Array32) -> None:
+def _merge_row(
+    camera: int, y: int, measured: Measured, ring: Ring, rows: Array32, places: I32
+) -> None:
     """Move points to the mean of all cameras that measure the same surface; who weighs less owns nothing."""
-    height, width = measured.inverse.shape[1], measured.inverse.shape[2]
-    shared, weights = ring.shared[camera, y], measured.weight[camera, y]
-    for x in range(width):
-        if shared[x] == 0 or weights[x] <= _ZERO:
-            continue
-        px, py, pz = rows[0, x], rows[1, x], rows[2, x]
-        own = total = weights[x]
-        sum_x, sum_y, sum_z = own * px, own * py, own * pz
-        for k in range(ring.partners.shape[1]):
-            if not (shared[x] >> k) & 1:
-                continue
-            other = ring.partners[camera, k]
-            column, row, z = _pixel(ring.T_grid_rig[other], ring.lenses[other], px, py, pz)
-            if column < 0 or row < 0 or column >= width or row >= height:
-                continue
-            weight = measured.weight[other, row, column]
-            if weight <= _ZERO:
-                continue
-            inverse = _ONE / measured.inverse[other, row, column]
-            ox = ring.origins[other, 0] + ring.rays[other, 0, row, column] * inverse
-            oy = ring.origins[other, 1] + ring.rays[other, 1, row, column] * inverse
-            oz = ring.origins[other, 2] + ring.rays[other, 2, row, column] * inverse
-            tolerance = _SAME_SURFACE_M + _SAME_SURFACE_RATIO * z
-            away = (ox - px) * (ox - px) + (oy - py) * (oy - py) + (oz - pz) * (oz - pz)
-            if away > tolerance * tolerance:
-                continue
-            total += weight
-            sum_x, sum_y, sum_z = sum_x + weight * ox, sum_y + weight * oy, sum_z + weight * oz
-            if weight > own or (weight == own and other < camera):
-                rows[5, x] = _ZERO
-        rows[0, x], rows[1, x], rows[2, x] = sum_x / total, sum_y / total, sum_z / total
+    own = measured.weight[camera, y]
+    first, last = own.size, 0
+    for k in range(ring.partners.shape[1]):
+        if ring.partners[camera, k] >= 0 and ring.spans[camera, k, y, 0] < ring.spans[camera, k, y, 1]:
+            first = min(first, ring.spans[camera, k, y, 0])
+            last = max(last, ring.spans[camera, k, y, 1])
+    if first >= last:
+        return
+    # Unsigned: an index that might be negative keeps a loop from becoming vector instructions.
+    _begin_sums(np.uint64(first), np.uint64(last), own, rows)
+    for k in range(ring.partners.shape[1]):
+        other = ring.partners[camera, k]
+        if other >= 0 and ring.spans[camera, k, y, 0] < ring.spans[camera, k, y, 1]:
+            begin, end = np.uint64(ring.spans[camera, k, y, 0]), np.uint64(ring.spans[camera, k, y, 1])
+            shape = measured.inverse.shape[1], measured.inverse.shape[2]
+            _partner_pixels(begin, end, ring.T_grid_rig[other], ring.lenses[other], shape, rows, places)
+            _add_partner(begin, end, other, other < camera, own, measured, ring, rows, places)
+    _end_sums(np.uint64(first), np.uint64(last), rows)
 
 
 @inlined
-def _pixel(T: Array32, lens: Array32, x: F32, y: F32, z: F32) -> tuple[int, int, F32]:
-    """Column and row of the depth pixel on which a point falls, −1 behind the camera, and its depth."""
-    depth = T[2, 0] * x + T[2, 1] * y + T[2, 2] * z + T[2, 3]
-    if depth < F32(0.1):
-        return -1, -1, depth
-    a = (T[0, 0] * x + T[0, 1] * y + T[0, 2] * z + T[0, 3]) / depth
-    b = (T[1, 0] * x + T[1, 1] * y + T[1, 2] * z + T[1, 3]) / depth
-    r2 = a * a + b * b
-    radial = _ONE + r2 * (lens[4] + r2 * (lens[5] + r2 * lens[8]))
-    u = a * radial + _TWO * lens[6] * a * b + lens[7] * (r2 + _TWO * a * a)
-    v = b * radial + lens[6] * (r2 + _TWO * b * b) + _TWO * lens[7] * a * b
-    u = lens[0] * u + lens[2] + _HALF
-    v = lens[1] * v + lens[3] + _HALF
-    if not (_ZERO <= u < F32(1e5) and _ZERO <= v < F32(1e5)):
-        return -1, -1, depth
-    return int(u), int(v), depth
+def _begin_sums(first: np.uint64, last: np.uint64, own: Array32, rows: Array32) -> None:
+    for x in range(first, last):
+        rows[_TOTAL, x] = own[x]
+        rows[_DX, x], rows[_DY, x], rows[_DZ, x] = _ZERO, _ZERO, _ZERO
+
+
+@inlined
+def _end_sums(first: np.uint64, last: np.uint64, rows: Array32) -> None:
+    for x in range(first, last):
+        share = _ONE / max(rows[_TOTAL, x], F32(1e-20))
+        rows[_X, x] += rows[_DX, x] * share
+        rows[_Y, x] += rows[_DY, x] * share
+        rows[_Z, x] += rows[_DZ, x] * share
+
+
+@inlined
+def _partner_pixels(
+    begin: np.uint64,
+    end: np.uint64,
+    T: Array32,
+    lens: Array32,
+    shape: tuple[int, int],
+    rows: Array32,
+    places: I32,
+) -> None:
+    """Flat index of the partner's depth pixel on which each point falls, −1 for none, and its depth there."""
+    height, width = np.int32(shape[0]), np.int32(shape[1])
+    right, bottom = F32(width) - _HALF, F32(height) - _HALF
+    # Read before the loop: the compiler cannot know that what the loop writes is not these tables.
+    t00, t01, t02, t03 = T[0, 0], T[0, 1], T[0, 2], T[0, 3]
+    t10, t11, t12, t13 = T[1, 0], T[1, 1], T[1, 2], T[1, 3]
+    t20, t21, t22, t23 = T[2, 0], T[2, 1], T[2, 2], T[2, 3]
+    fx, fy, cx, cy, k1, k2, p1, p2, k3 = (
+        lens[0], lens[1], lens[2], lens[3], lens[4], lens[5], lens[6], lens[7], lens[8],
+    )  # fmt: skip
+    for i in range(begin, end):
+        x, y, z = rows[_X, i], rows[_Y, i], rows[_Z, i]
+        depth = max(t20 * x + t21 * y + t22 * z + t23, F32(0.05))
+        a = (t00 * x + t01 * y + t02 * z + t03) / depth
+        b = (t10 * x + t11 * y + t12 * z + t13) / depth
+        r2 = a * a + b * b
+        radial = _ONE + r2 * (k1 + r2 * (k2 + r2 * k3))
+        u = fx * (a * radial + _TWO * p1 * a * b + p2 * (r2 + _TWO * a * a)) + cx
+        v = fy * (b * radial + p1 * (r2 + _TWO * b * b) + _TWO * p2 * a * b) + cy
+        seen = (u > -_HALF) & (u < right) & (v > -_HALF) & (v < bottom) & (r2 < _WIDEST) & (depth > F32(0.1))
+        column = np.int32(min(max(u + _HALF, _ZERO), right))
+        row = np.int32(min(max(v + _HALF, _ZERO), bottom))
+        rows[_DEPTH, i] = depth
+        places[i] = np.int32(row * width + column) if seen else np.int32(-1)
+
+
+@inlined
+def _add_partner(
+    begin: np.uint64,
+    end: np.uint64,
+    other: int,
+    first_of_both: bool,
+    own: Array32,
+    measured: Measured,
+    ring: Ring,
+    rows: Array32,
+    places: I32,
+) -> None:
+    """Add what the partner measures on its own ray through each point, where that is the same surface."""
+    inverse, weights = measured.inverse[other].reshape(-1), measured.weight[other].reshape(-1)
+    for x in range(begin, end):  # apart from the next loop: gathers keep a loop from becoming vectors
+        place = np.uint64(max(places[x], np.int32(0)))
+        rows[_INVERSE, x] = inverse[place]
+        rows[_WEIGHT, x] = weights[place] if places[x] >= 0 else _ZERO
+    x0, y0, z0 = ring.origins[other, 0], ring.origins[other, 1], ring.origins[other, 2]
+    for x in range(begin, end):
+        depth = rows[_DEPTH, x]
+        away = _ONE / rows[_INVERSE, x] - depth
+        same = abs(away) < _SAME_SURFACE_M + _SAME_SURFACE_RATIO * depth
+        weight = rows[_WEIGHT, x] if same else _ZERO
+        change = weight * away / depth
+        rows[_TOTAL, x] += weight
+        rows[_DX, x] += change * (rows[_X, x] - x0)
+        rows[_DY, x] += change * (rows[_Y, x] - y0)
+        rows[_DZ, x] += change * (rows[_Z, x] - z0)
+        yields = (weight > own[x]) | ((weight == own[x]) & first_of_both)
+        rows[_OWNED, x] = _ZERO if yields else rows[_OWNED, x]
 
 
 @inlined
 def _project_row(drum: Drum, rows: Array32) -> None:
-    """Distance from the cylinder's axis (row 6), and column and row of it (7, 8), of the points."""
+    """Distance of the points from the cylinder's axis, and column and row of it, as they are cut to integers."""
     T = drum.T_view_rig
     for i in range(rows.shape[1]):
-        x = T[0, 0] * rows[0, i] + T[0, 1] * rows[1, i] + T[0, 2] * rows[2, i] + T[0, 3]
-        y = T[1, 0] * rows[0, i] + T[1, 1] * rows[1, i] + T[1, 2] * rows[2, i] + T[1, 3]
-        z = T[2, 0] * rows[0, i] + T[2, 1] * rows[1, i] + T[2, 2] * rows[2, i] + T[2, 3]
+        x = T[0, 0] * rows[_X, i] + T[0, 1] * rows[_Y, i] + T[0, 2] * rows[_Z, i] + T[0, 3]
+        y = T[1, 0] * rows[_X, i] + T[1, 1] * rows[_Y, i] + T[1, 2] * rows[_Z, i] + T[1, 3]
+        z = T[2, 0] * rows[_X, i] + T[2, 1] * rows[_Y, i] + T[2, 2] * rows[_Z, i] + T[2, 3]
         distance = max(F32(np.sqrt(x * x + y * y)), F32(1e-6))
         turned = drum.azimuth_left - _azimuth(x, y) + _HALF / drum.pixels_per_rad
         turned -= _TURN * F32(np.floor(turned / _TURN))
-        rows[6, i] = distance
-        rows[7, i] = turned * drum.pixels_per_rad
-        rows[8, i] = (drum.slope_top - z / distance) * drum.pixels_per_rad + _HALF
+        rows[_DISTANCE, i] = distance
+        rows[_COLUMN, i] = turned * drum.pixels_per_rad
+        rows[_ROW, i] = (drum.slope_top - z / distance) * drum.pixels_per_rad + _HALF
 
 
 @inlined
@@ -350,90 +428,83 @@ def _azimuth(x: F32, y: F32) -> F32:
 
 
 @inlined
-def _paint_row(
+def _address_row(
     camera: int,
-    y: int,
-    weights: Array32,
     drum: Drum,
-    image: U8,
+    weights: Array32,
+    wide: int,
+    high: int,
     kind: int,
-    gains: U8,
-    scan: int,
     rows: Array32,
-    points: Array32,
-    colors: U8,
-    count: int,
-) -> int:
-    """Colour the points of one row, write those that are owned, and draw all into the window.
+    addresses: I32,
+) -> None:
+    """The colour pixel and the window's cell of each point, and what is written there, as integers."""
+    lines, columns = np.int32(drum.cells.shape[1]), np.int32(drum.cells.shape[2])
+    start, circle, bottom = np.int32(drum.starts[camera]), np.int32(drum.circle), F32(drum.cells.shape[1])
+    right, below = F32(wide - 1), F32(high - 1)
+    shift = _ZERO if kind == BAYER else _HALF
+    for x in range(weights.size):
+        u, v = rows[_U, x], rows[_V, x]
+        shown = (weights[x] > _ZERO) & (u >= _ZERO) & (u < right) & (v >= _ZERO) & (v < below)
+        addresses[_AT_U, x] = np.int32(min(max(u, _ZERO), right) + shift) if shown else np.int32(-1)
+        addresses[_AT_V, x] = np.int32(min(max(v, _ZERO), below) + shift)
+        column = np.int32(rows[_COLUMN, x]) - start
+        column = column + circle if column < 0 else column
+        row = np.int32(min(max(rows[_ROW, x], -_ONE), bottom))
+        drawn = (column < columns) & (row < lines) & (rows[_ROW, x] >= _ZERO)
+        addresses[_PLACE, x] = np.int32(row * columns + column) if drawn else np.int32(-1)
+        square = rows[_DISTANCE, x] * rows[_DISTANCE, x]  # undoes q⁴: both cameras of a seam are equally far
+        addresses[_UNITS, x] = np.int32(min(rows[_DISTANCE, x], F32(1e4)) * _UNITS_A_METRE)
+        addresses[_PART, x] = np.int32(min(max(weights[x] * square * square * _SHARE, _ONE), F32(255.0)))
+
+
+@inlined
+def _unhidden(us: Array32, scan: int, addresses: I32) -> int:
+    """List the columns of points that the colour camera sees; how many.
 
     Walking against the direction in which near things are shifted in the colour image, a point whose pixel
-    one passed before is hidden there behind something nearer.
+    one has passed before is hidden there behind something nearer.
     """
-    width, high = weights.shape[2], image.shape[0]
-    wide = image.shape[1] // 3 if kind == BGR else image.shape[1]
+    width = us.size
     farthest = F32(-1e9)
+    kept = 0
     for step in range(width):
         x = step if scan > 0 else width - 1 - step
-        weight = weights[camera, y, x]
-        if weight <= _ZERO:
-            continue
-        u, v = rows[3, x], rows[4, x]
-        along = u if scan > 0 else -u
-        if along <= farthest or not (_ZERO <= u < F32(wide - 1) and _ZERO <= v < F32(high - 1)):
-            continue
-        farthest = along
-        red, green, blue = _color(image, kind, u, v)
-        red, green, blue = gains[0, red], gains[1, green], gains[2, blue]
-        if rows[5, x] > _ZERO:
-            points[count, 0], points[count, 1], points[count, 2] = rows[0, x], rows[1, x], rows[2, x]
-            colors[count, 0], colors[count, 1], colors[count, 2] = red, green, blue
-            count += 1
-        _draw(drum, camera, rows, x, weight, red, green, blue)
-    return count
+        along = us[x] if scan > 0 else -us[x]
+        seen = (addresses[_AT_U, x] >= 0) & (along > farthest)
+        farthest = along if seen else farthest
+        addresses[_KEPT, kept] = x
+        kept += int(seen)
+    return kept
 
 
 @inlined
-def _color(image: U8, kind: int, u: F32, v: F32) -> tuple[int, int, int]:
+def _color(image: U8, kind: int, u: np.int32, v: np.int32) -> tuple[np.uint8, np.uint8, np.uint8]:
     """RGB at a pixel that has a right and a lower neighbour.
 
-    Any 2×2 pixels of a mosaic hold red, blue and two greens: those around (u, v) are half a pixel off at most.
+    Any 2×2 pixels of a mosaic hold red, blue and two greens: those around a point are half a pixel off at most.
     """
+    row, column = np.uint64(v), np.uint64(u)
     if kind == BAYER:
-        column, row = int(u), int(v)
-        top, bottom = image[row], image[row + 1]
-        a, b, c, d = top[column], top[column + 1], bottom[column], bottom[column + 1]
-        if row & 1:
-            a, b, c, d = c, d, a, b
-        if column & 1:
-            a, b, c, d = b, a, d, c
-        return int(b), (int(a) + int(d) + 1) >> 1, int(c)
-    column, row = int(u + _HALF), int(v + _HALF)
+        odd_row, odd_column, mixed = row & _BIT, column & _BIT, (row ^ column) & _BIT
+        red = image[row + odd_row, column + (_BIT - odd_column)]
+        blue = image[row + (_BIT - odd_row), column + odd_column]
+        greens = np.uint16(image[row, column + mixed]) + np.uint16(image[row + _BIT, column + (_BIT - mixed)])
+        return red, np.uint8((greens + np.uint16(1)) >> np.uint16(1)), blue
     if kind == BGR:
-        return int(image[row, 3 * column + 2]), int(image[row, 3 * column + 1]), int(image[row, 3 * column])
-    return int(image[row, column]), int(image[row, column]), int(image[row, column])
+        place = column * np.uint64(3)
+        return image[row, place + np.uint64(2)], image[row, place + _BIT], image[row, place]
+    return image[row, column], image[row, column], image[row, column]
 
 
 @inlined
-def _draw(
-    drum: Drum, camera: int, rows: Array32, x: int, weight: F32, red: int, green: int, blue: int
-) -> None:
-    """Draw a point into its camera's window: distance, weight and colour in one number, the nearest wins."""
-    cells = drum.cells[camera]
-    column = int(rows[7, x]) - drum.starts[camera]
-    if column < 0:
-        column += drum.circle
-    if rows[8, x] < _ZERO:
-        return
-    row = int(rows[8, x])
-    if column < 0 or column >= cells.shape[1] or row >= cells.shape[0]:
-        return
-    key = np.uint64(rows[6, x] * F32(1e5)) << np.uint64(32)  # 10 micrometres
-    square = rows[6, x] * rows[6, x]  # undoes q⁴: both cameras of a seam are equally far
-    share = np.uint64(min(max(weight * square * square * _SHARE, _ONE), F32(255.0)))
-    key |= share << np.uint64(24) | np.uint64(red) << np.uint64(16)
-    key |= np.uint64(green) << np.uint64(8) | np.uint64(blue)
-    if key < cells[row, column]:
-        cells[row, column] = key
+def _draw(cells: U64, addresses: I32, x: int, red: np.uint8, green: np.uint8, blue: np.uint8) -> None:
+    """Draw a point into its camera's window: distance, weight and colour in one number, the least stays."""
+    if addresses[_PLACE, x] >= 0:
+        place = np.uint64(addresses[_PLACE, x])
+        key = np.uint64(addresses[_UNITS, x]) << np.uint64(32) | np.uint64(addresses[_PART, x]) << np.uint64(24)
+        key |= np.uint64(red) << np.uint64(16) | np.uint64(green) << np.uint64(8) | np.uint64(blue)
+        cells[place] = min(cells[place], key)
 
 
 @compiled()
@@ -447,49 +518,51 @@ def blend_rows(
     width = depth.shape[1]
     for row in range(first, last):
         sums[0], sums[1:] = F32(np.inf), _ZERO
-        for camera in range(drum.cells.shape[0]):
-            if present[camera]:
-                _find_nearest(drum, camera, row, sums)
-        for camera in range(drum.cells.shape[0]):
-            if present[camera]:
-                _add_window(drum, camera, row, sums)
+        for step in range(2):  # all must have been looked at before the front is known
+            for camera in range(drum.cells.shape[0]):
+                start, cells = drum.starts[camera], drum.cells[camera, row]
+                if present[camera]:
+                    # Beyond the border of a closed cylinder the window goes on at the other one.
+                    before = max(min(width - start, cells.size), 0)
+                    after = max(min(start + cells.size - drum.circle, width), 0)
+                    _take_window(step, cells[:before], sums, np.uint64(start))
+                    _take_window(step, cells[cells.size - after :], sums, np.uint64(0))
         for x in range(width):
             total = sums[1, x]
-            depth[row, x] = sums[2, x] / total if total > _ZERO else F32(np.nan)
-            scale = _ONE / total if total > _ZERO else _ZERO
+            scale = _ONE / max(total, _ONE)
+            depth[row, x] = sums[2, x] * scale / _UNITS_A_METRE if total > _ZERO else F32(np.nan)
             for channel in range(3):
                 color[row, x, channel] = np.uint8(sums[5 - channel, x] * scale + _HALF)
 
 
 @inlined
-def _find_nearest(drum: Drum, camera: int, row: int, sums: Array32) -> None:
-    cells = drum.cells[camera, row]
-    for i in range(cells.size):
-        x = drum.starts[camera] + i
-        x = x - drum.circle if x >= drum.circle else x
-        if x < sums.shape[1] and cells[i] != EMPTY:
-            sums[0, x] = min(sums[0, x], F32(cells[i] >> np.uint64(32)))
+def _take_window(step: int, cells: U64, sums: Array32, first: np.uint64) -> None:
+    if step == 0:
+        _find_nearest(cells, sums, first)
+    else:
+        _add_window(cells, sums, first)
 
 
 @inlined
-def _add_window(drum: Drum, camera: int, row: int, sums: Array32) -> None:
-    cells = drum.cells[camera, row]
+def _find_nearest(cells: U64, sums: Array32, first: np.uint64) -> None:
+    for i in range(np.uint64(cells.size)):
+        distance = F32(np.uint32(cells[i] >> np.uint64(32)))
+        sums[0, first + i] = min(sums[0, first + i], distance)
+
+
+@inlined
+def _add_window(cells: U64, sums: Array32, first: np.uint64) -> None:
     byte = np.uint64(255)
-    for i in range(cells.size):
-        x = drum.starts[camera] + i
-        x = x - drum.circle if x >= drum.circle else x
-        key = cells[i]
-        if x >= sums.shape[1] or key == EMPTY:
-            continue
-        distance = F32(key >> np.uint64(32))
-        if distance > _FRONT_RATIO * sums[0, x]:
-            continue
-        weight = F32(key >> np.uint64(24) & byte)
+    for i in range(np.uint64(cells.size)):
+        x, key = first + i, cells[i]
+        distance = F32(np.uint32(key >> np.uint64(32)))
+        shown = (distance <= _FRONT_RATIO * sums[0, x]) & (key != EMPTY)
+        weight = F32(np.int32(key >> np.uint64(24) & byte)) if shown else _ZERO
         sums[1, x] += weight
-        sums[2, x] += weight * distance * F32(1e-5)
-        sums[3, x] += weight * F32(key >> np.uint64(16) & byte)
-        sums[4, x] += weight * F32(key >> np.uint64(8) & byte)
-        sums[5, x] += weight * F32(key & byte)
+        sums[2, x] += weight * distance
+        sums[3, x] += weight * F32(np.int32(key >> np.uint64(16) & byte))
+        sums[4, x] += weight * F32(np.int32(key >> np.uint64(8) & byte))
+        sums[5, x] += weight * F32(np.int32(key & byte))
 
 
 @compiled()

@@ -21,10 +21,11 @@ from rig_protocol.poses import Pose, inverse, transform_points
 Array = npt.NDArray[np.float64]
 Array32 = npt.NDArray[np.float32]
 
-MAX_PARTNERS = 8  # a bit each
+MAX_PARTNERS = 8
 _BLOCK_PX = 8  # shared views are found at every eighth pixel, and widened by as much
 _RANGES_M = np.array([MIN_RANGE_M, 0.55, 0.8, 1.2, 2.0, 4.0, MAX_RANGE_M])
 _USUAL_RANGES_M = np.array([1.0, 2.0, 4.0])  # where the panorama's border is to be right
+_COLOR_RANGES_M = (0.55, MAX_RANGE_M)
 _HIDDEN = -1e4  # the colour pixel of what the colour camera cannot see
 
 
@@ -62,35 +63,40 @@ class PlacedGrid:
         return Lens(*map(np.float32, numbers))
 
     def rays(self) -> Array:
-        """Rays (H,W,3) in the grid's frame, times the depth correction: the point is ray · measured z."""
+        """Rays (H,W,3) in the grid's frame, z = 1."""
         plane = pixel_rays(self.grid.intrinsics)
-        rays = np.concatenate([plane, np.ones((*self.shape, 1))], axis=-1)
+        return np.concatenate([plane, np.ones((*self.shape, 1))], axis=-1)
+
+    def scale(self) -> Array:
+        """What (H,W) makes corrected 1/z of q = numerator / z."""
+        scale = np.full(self.shape, 1.0 / self.grid.raw_model.numerator_m)
         if self.correction is None:
-            return rays
+            return scale
         rows, columns = np.indices(self.shape)
         at = from_pixels(self.grid.intrinsics, np.stack([columns, rows], axis=-1).astype(np.float64))
-        return np.asarray(rays * self.correction.factor(at[..., 0], at[..., 1])[..., None])
+        return np.asarray(scale / self.correction.factor(at[..., 0], at[..., 1]))
 
-    def color_pixels(self, rays: Array) -> Array:
-        """(4,H,W): u, v, du, dv of the colour pixel (u, v) + q·(du, dv).
+    def color_pixels(self) -> Array:
+        """(4,H,W): u, v, du, dv of the colour pixel (u, v) + (du, dv) / z.
 
-        Straight in q but for the lens's curvature over the parallax, a tenth of a pixel: a line through what
-        is seen at 0.55 and at 8 m.
+        Straight in 1/z but for the lens's curvature over the parallax, a tenth of a pixel: a line through
+        what is seen at 0.55 and at 8 m.
         """
-        flat = rays.reshape(-1, 3)
-        found, q = [], []
-        for range_m in (0.55, MAX_RANGE_M):
-            points = transform_points(self.grid.T_color_grid, flat * range_m)
-            seen = in_field(self.model.color, points)
-            pixels = np.full((len(flat), 2), np.nan)
-            pixels[seen] = project(self.model.color, points[seen])
-            found.append(pixels)
-            q.append(self.grid.raw_model.numerator_m / range_m)
-        slope = (found[0] - found[1]) / (q[0] - q[1])
-        table = np.concatenate([found[1] - slope * q[1], slope], axis=1).T.reshape(4, *self.shape)
+        flat = self.rays().reshape(-1, 3)
+        near_m, far_m = _COLOR_RANGES_M
+        near, far = (self._color_pixels_at(flat * range_m) for range_m in _COLOR_RANGES_M)
+        slope = (near - far) / (1 / near_m - 1 / far_m)
+        table = np.concatenate([far - slope / far_m, slope], axis=1).T.reshape(4, *self.shape)
         unseen = ~np.isfinite(table).all(axis=0)
         table[:, unseen] = np.array([_HIDDEN, _HIDDEN, 0.0, 0.0])[:, None]
         return np.asarray(table)
+
+    def _color_pixels_at(self, points: Array) -> Array:
+        points = transform_points(self.grid.T_color_grid, points)
+        seen = in_field(self.model.color, points)
+        pixels = np.full((len(points), 2), np.nan)
+        pixels[seen] = project(self.model.color, points[seen])
+        return pixels
 
     def points(self, ranges_m: Array, step: int) -> Array:
         """Points (R,h,w,3) of the rig frame at every `step`-th pixel and some depths; NaN without a ray."""
@@ -110,20 +116,18 @@ def ring_tables(grids: Sequence[PlacedGrid]) -> Ring:
     """Tables of cameras whose depth images are of one size."""
     shape = grids[0].shape
     rays = np.empty((len(grids), 3, *shape), np.float32)
-    color_pixels = np.empty((len(grids), 4, *shape), np.float32)
     for i, grid in enumerate(grids):
-        own = grid.rays()
-        turned = own @ grid.T_rig_grid[:3, :3].T * grid.grid.raw_model.numerator_m
-        rays[i], color_pixels[i] = turned.transpose(2, 0, 1), grid.color_pixels(own)
-    partners, shared = _shared_views(grids)
+        rays[i] = (grid.rays() @ grid.T_rig_grid[:3, :3].T).transpose(2, 0, 1)
+    partners, spans = _shared_views(grids)
     return Ring(
-        rays=rays,
+        scales=np.array([grid.scale() for grid in grids], np.float32),
+        rays=np.nan_to_num(rays),
         origins=np.array([grid.T_rig_grid[:3, 3] for grid in grids], np.float32),
-        color_pixels=color_pixels,
+        color_pixels=np.array([grid.color_pixels() for grid in grids], np.float32),
         T_grid_rig=np.array([inverse(grid.T_rig_grid)[:3] for grid in grids], np.float32),
         lenses=np.array([_lens_numbers(grid.grid.intrinsics) for grid in grids], np.float32),
         partners=partners,
-        shared=shared,
+        spans=spans,
     )
 
 
@@ -169,26 +173,28 @@ def _window(grid: PlacedGrid, T_view_rig: Pose, cylinder: Cylinder, circle_px: i
     return (start % circle_px, width) if width < circle_px else (0, circle_px)
 
 
-def _shared_views(grids: Sequence[PlacedGrid]) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.uint8]]:
+def _shared_views(grids: Sequence[PlacedGrid]) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]]:
+    """Partners (C,K) of every camera, those that share most first, and spans (C,K,H,2) of columns."""
     partners = np.full((len(grids), MAX_PARTNERS), -1, np.int64)
-    shared = np.zeros((len(grids), *grids[0].shape), np.uint8)
+    spans = np.zeros((len(grids), MAX_PARTNERS, grids[0].shape[0], 2), np.int64)
     for i, grid in enumerate(grids):
         points = grid.points(_RANGES_M, _BLOCK_PX)
         masks = {j: other.sees(points).any(axis=0) for j, other in enumerate(grids) if j != i}
         by_share = sorted((j for j in masks if masks[j].any()), key=lambda j: (-np.count_nonzero(masks[j]), j))
         for k, j in enumerate(by_share[:MAX_PARTNERS]):
             partners[i, k] = j
-            shared[i] |= _widened(masks[j], grid.shape).astype(np.uint8) << k
-    return partners, shared
+            spans[i, k] = _spans(masks[j], grid.shape)
+    return partners, spans
 
 
-def _widened(blocks: npt.NDArray[np.bool_], shape: tuple[int, int]) -> npt.NDArray[np.bool_]:
-    """The mask at full size, every block with its neighbours."""
-    padded = np.pad(blocks, 1)
-    near = [padded[a : a + blocks.shape[0], b : b + blocks.shape[1]] for a in range(3) for b in range(3)]
-    grown = np.logical_or.reduce(near)
-    full = np.repeat(np.repeat(grown, _BLOCK_PX, axis=0), _BLOCK_PX, axis=1)
-    return np.asarray(full[: shape[0], : shape[1]])
+def _spans(blocks: npt.NDArray[np.bool_], shape: tuple[int, int]) -> npt.NDArray[np.int64]:
+    """First column and the one after the last (H,2) of the blocks that are set, each with its neighbours."""
+    rows = np.pad(blocks, ((1, 1), (0, 0)))
+    rows = rows[:-2] | rows[1:-1] | rows[2:]
+    first = (rows.argmax(axis=1) - 1) * _BLOCK_PX
+    last = (rows.shape[1] - rows[:, ::-1].argmax(axis=1) + 1) * _BLOCK_PX
+    spans = np.clip(np.stack([first, last], axis=1), 0, shape[1]) * rows.any(axis=1)[:, None]
+    return np.asarray(np.repeat(spans, _BLOCK_PX, axis=0)[: shape[0]], dtype=np.int64)
 
 
 def _lens_numbers(intrinsics: Intrinsics) -> tuple[float, ...]:
