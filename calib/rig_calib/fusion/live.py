@@ -187,7 +187,7 @@ class LiveFusion:
         count, (height, width) = len(self.camera_ids), shape
         self._capacity = height * width
         self._measured = Measured(
-            np.zeros((count, height, width), np.float32), np.zeros((count, height, width), np.float32)
+            np.ones((count, height, width), np.float32), np.zeros((count, height, width), np.float32)
         )
         self._present = np.zeros(count, np.uint8)
         self._counts = np.zeros(count, np.int64)
@@ -230,7 +230,9 @@ class LiveFusion:
             return
         scratch, sums = self._scratches.get()
         inverse_m, weight = self._measured.inverse[k], self._measured.weight[k]
-        clean_depth(images.depth, images.in_mm, self._lenses[k], self._ring.scales[k], scratch, inverse_m, weight)
+        clean_depth(
+            images.depth, images.in_mm, self._lenses[k], self._ring.scales[k], scratch, inverse_m, weight
+        )
         self._scratches.put((scratch, sums))
 
     def _place(self, k: int, images: "_Images | None") -> None:

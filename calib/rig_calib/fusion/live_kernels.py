@@ -26,7 +26,7 @@ EMPTY = np.uint64(0xFFFF_FFFF_FFFF_FFFF)
 _NONE = F32(1e6)  # q of a pixel without depth: a huge step to every neighbour
 _MEASURED = F32(1e5)
 # The offline cleaning's rules (cleaning.py, depth_model.py): a step of six sigmas, and 80 degrees.
-_EDGE_STEP = F32(3.0)
+_EDGE_SUM = F32(3 * 3.0)  # over three pixels
 _COS2_STEEPEST = F32(np.cos(np.deg2rad(80.0)) ** 2)
 _REACH, _LEAST_AROUND = 4, 20  # of the 9×9 pixels around a point, so many must lie on a surface
 _SAME_SURFACE_M, _SAME_SURFACE_RATIO = F32(0.03), F32(0.03)  # within it two cameras measure one thing
@@ -36,7 +36,7 @@ _WIDEST = F32(4.0)  # squared tangent: beyond it no camera looks, and a lens pol
 _BIT = np.uint64(1)
 _SHARE = F32(1.8)  # makes the weight of a camera that looks straight at a surface fill a byte
 _ZERO, _HALF, _ONE, _TWO = F32(0.0), F32(0.5), F32(1.0), F32(2.0)
-_PI, _HALF_PI, _TURN = F32(np.pi), F32(np.pi / 2), F32(2 * np.pi)
+_PI, _HALF_PI, _TURN, _SIX = F32(np.pi), F32(np.pi / 2), F32(2 * np.pi), F32(6.0)
 
 
 class Lens(NamedTuple):
@@ -166,13 +166,18 @@ def _on_surface(scratch: Scratch, y: int, lens: Lens, height: int) -> None:
     ray_y = (F32(y) - lens.cy) / lens.fy
     solid[0], solid[width - 1] = 0, 0
     for x in range(1, width - 1):
-        c, left, right, up, down = row[x], row[x - 1], row[x + 1], above[x], below[x]
-        across, along = abs(left + right - _TWO * c), abs(up + down - _TWO * c)
-        nx, ny = _HALF * (right - left) * lens.fx, _HALF * (down - up) * lens.fy
+        c, up, down = row[x], above[x], below[x]
+        left, left_up, left_down = row[x - 1], above[x - 1], below[x - 1]
+        right, right_up, right_down = row[x + 1], above[x + 1], below[x + 1]
+        # Sums of three rows and of three columns: of single pixels the noise alone makes steps and slopes.
+        west, middle, east = left_up + left + left_down, up + c + down, right_up + right + right_down
+        north, waist, south = left_up + up + right_up, left + c + right, left_down + down + right_down
+        across, along = abs(west + east - _TWO * middle), abs(north + south - _TWO * waist)
+        nx, ny = (east - west) * lens.fx / _SIX, (south - north) * lens.fy / _SIX
         ray_x = (F32(x) - lens.cx) / lens.fx
         nz = c - nx * ray_x - ny * ray_y
         cos2 = c * c / ((nx * nx + ny * ny + nz * nz) * (_ONE + ray_x * ray_x + ray_y * ray_y))
-        good = (c < _MEASURED) & (across < _EDGE_STEP) & (along < _EDGE_STEP) & (cos2 > _COS2_STEEPEST)
+        good = (c < _MEASURED) & (across < _EDGE_SUM) & (along < _EDGE_SUM) & (cos2 > _COS2_STEEPEST)
         solid[x] = np.uint8(good)
         border = min(min(F32(x), F32(width - 1 - x)) + _HALF, down_edge) / half
         scaled = c * F32(0.01)
@@ -289,9 +294,7 @@ def _place_row(camera: int, y: int, measured: Measured, ring: Ring, rows: Array3
 
 
 @inlined
-def _merge_row(
-    camera: int, y: int, measured: Measured, ring: Ring, rows: Array32, places: I32
-) -> None:
+def _merge_row(camera: int, y: int, measured: Measured, ring: Ring, rows: Array32, places: I32) -> None:
     """Move points to the mean of all cameras that measure the same surface; who weighs less owns nothing."""
     own = measured.weight[camera, y]
     first, last = own.size, 0
@@ -502,7 +505,9 @@ def _draw(cells: U64, addresses: I32, x: int, red: np.uint8, green: np.uint8, bl
     """Draw a point into its camera's window: distance, weight and colour in one number, the least stays."""
     if addresses[_PLACE, x] >= 0:
         place = np.uint64(addresses[_PLACE, x])
-        key = np.uint64(addresses[_UNITS, x]) << np.uint64(32) | np.uint64(addresses[_PART, x]) << np.uint64(24)
+        key = np.uint64(addresses[_UNITS, x]) << np.uint64(32) | np.uint64(addresses[_PART, x]) << np.uint64(
+            24
+        )
         key |= np.uint64(red) << np.uint64(16) | np.uint64(green) << np.uint64(8) | np.uint64(blue)
         cells[place] = min(cells[place], key)
 
@@ -566,9 +571,7 @@ def _add_window(cells: U64, sums: Array32, first: np.uint64) -> None:
 
 
 @compiled()
-def close_ranks(
-    points: Array32, colors: U8, capacity: int, counts: npt.NDArray[np.int64]
-) -> int:
+def close_ranks(points: Array32, colors: U8, capacity: int, counts: npt.NDArray[np.int64]) -> int:
     """Move every camera's points, which begin at multiples of `capacity`, up to those before; how many."""
     end = 0
     for camera in range(counts.size):

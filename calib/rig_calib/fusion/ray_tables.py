@@ -180,7 +180,9 @@ def _shared_views(grids: Sequence[PlacedGrid]) -> tuple[npt.NDArray[np.int64], n
     for i, grid in enumerate(grids):
         points = grid.points(_RANGES_M, _BLOCK_PX)
         masks = {j: other.sees(points).any(axis=0) for j, other in enumerate(grids) if j != i}
-        by_share = sorted((j for j in masks if masks[j].any()), key=lambda j: (-np.count_nonzero(masks[j]), j))
+        by_share = sorted(
+            (j for j in masks if masks[j].any()), key=lambda j: (-np.count_nonzero(masks[j]), j)
+        )
         for k, j in enumerate(by_share[:MAX_PARTNERS]):
             partners[i, k] = j
             spans[i, k] = _spans(masks[j], grid.shape)
