@@ -277,6 +277,8 @@ def _scratch(shape: tuple[int, int]) -> Scratch:
         columns=np.zeros(shape[1], np.int16),
         rows=np.zeros((16, shape[1]), np.float32),
         addresses=np.zeros((6, shape[1]), np.int32),
+        keys=np.zeros(shape[1], np.uint64),
+        ahead=np.full((2, shape[1] + 32), -1e9, np.float32),
     )
 
 

@@ -33,7 +33,7 @@ _SAME_SURFACE_M, _SAME_SURFACE_RATIO = F32(0.03), F32(0.03)  # within it two cam
 _FRONT_RATIO = F32(1.05)  # what is farther than this times the nearest of a panorama pixel is behind it
 _UNITS_A_METRE = F32(1e5)  # of a distance in the windows
 _WIDEST = F32(4.0)  # squared tangent: beyond it no camera looks, and a lens polynomial may fold back
-_BIT = np.uint64(1)
+_PASSED = 32  # columns looked back for what hides a point: the parallax of 0.5 m against far away
 _SHARE = F32(1.8)  # makes the weight of a camera that looks straight at a surface fill a byte
 _ZERO, _HALF, _ONE, _TWO = F32(0.0), F32(0.5), F32(1.0), F32(2.0)
 _PI, _HALF_PI, _TURN, _SIX = F32(np.pi), F32(np.pi / 2), F32(2 * np.pi), F32(6.0)
@@ -62,13 +62,16 @@ class Scratch(NamedTuple):
     columns: npt.NDArray[np.int16]  # (W,)
     rows: Array32  # (16,W), see below
     addresses: I32  # (6,W), see below
+    keys: U64  # (W,) distance and weight of a point, as they stand in a cell
+    ahead: Array32  # (2,W + 32) colour columns, with what lies before the first
 
 
 # Rows of `Scratch.rows` ...
 _X, _Y, _Z, _U, _V, _OWNED, _DISTANCE, _COLUMN, _ROW = range(9)
 _TOTAL, _DX, _DY, _DZ, _DEPTH, _INVERSE, _WEIGHT = range(9, 16)
-# ... and of `Scratch.addresses`: a partner's pixel or a cell of the window, −1 for none; colour pixel.
-_PLACE, _AT_U, _AT_V, _UNITS, _PART, _KEPT = range(6)
+# ... and of `Scratch.addresses`: a partner's pixel or a cell of the window, −1 for none; flat indices of a point's
+# red, blue and two green values, −1 for none; which columns are kept.
+_PLACE, _RED, _BLUE, _GREEN, _OTHER_GREEN, _KEPT = range(6)
 
 
 class Ring(NamedTuple):
@@ -90,7 +93,7 @@ class Ring(NamedTuple):
 
 
 class Drum(NamedTuple):
-    """The cylinder as the kernels need it; `starts` (C,) and cells (C,H,W') are every camera's window of it."""
+    """The cylinder as the kernels need it; `starts` (C,) and `cells` (C,H,W') are every camera's window."""
 
     T_view_rig: Array32  # (3,4)
     azimuth_left: F32
@@ -118,7 +121,7 @@ def clean_depth(
 
     Flying pixels sit beside edges and holes or are steep; what interference leaves are small islands.
     """
-    height, width = image.shape
+    height = image.shape[0]
     for y in range(height):
         _inverse_depth(image[y], in_mm, lens, scratch.inverse[y])
     scratch.solid[0], scratch.solid[height - 1] = 0, 0
@@ -256,22 +259,29 @@ def place_points(
     cells = drum.cells[camera].reshape(-1)
     cells[:] = EMPTY
     height, wide = measured.inverse.shape[1], image.shape[1] // 3 if kind == BGR else image.shape[1]
-    rows, addresses = scratch.rows, scratch.addresses
-    count = 0
+    rows, addresses, flat = scratch.rows, scratch.addresses, image.reshape(-1)
+    count = np.uint64(0)
     for y in range(height):
         _place_row(camera, y, measured, ring, rows)
         _merge_row(camera, y, measured, ring, rows, addresses[_PLACE])
         _project_row(drum, rows)
-        _address_row(camera, drum, measured.weight[camera, y], wide, image.shape[0], kind, rows, addresses)
-        kept = _unhidden(rows[_U], scan, addresses)
-        for k in range(kept):
-            x = addresses[_KEPT, k]
-            red, green, blue = _color(image, kind, addresses[_AT_U, x], addresses[_AT_V, x])
-            red, green, blue = gains[0, red], gains[1, green], gains[2, blue]
+        _address_row(camera, drum, measured.weight[camera, y], rows, scratch.keys, addresses[_PLACE])
+        _color_row(measured.weight[camera, y], wide, image.shape[0], kind, rows, addresses)
+        kept = _unhidden(rows[_U], scan, scratch.ahead, addresses)
+        for k in range(np.uint64(kept)):
+            x = np.uint64(addresses[_KEPT, k])
+            red = gains[0, flat[np.uint64(addresses[_RED, x])]]
+            blue = gains[2, flat[np.uint64(addresses[_BLUE, x])]]
+            greens = np.uint16(flat[np.uint64(addresses[_GREEN, x])])
+            greens += np.uint16(flat[np.uint64(addresses[_OTHER_GREEN, x])])
+            green = gains[1, np.uint8((greens + np.uint16(1)) >> np.uint16(1))]
             points[count, 0], points[count, 1], points[count, 2] = rows[_X, x], rows[_Y, x], rows[_Z, x]
             colors[count, 0], colors[count, 1], colors[count, 2] = red, green, blue
-            count += int(rows[_OWNED, x])
-            _draw(cells, addresses, x, red, green, blue)
+            count += np.uint64(rows[_OWNED, x])
+            if addresses[_PLACE, x] >= 0:
+                place = np.uint64(addresses[_PLACE, x])
+                key = np.uint64(red) << np.uint64(16) | np.uint64(green) << np.uint64(8) | np.uint64(blue)
+                cells[place] = min(cells[place], scratch.keys[x] | key)
     return count
 
 
@@ -403,7 +413,7 @@ def _add_partner(
 
 @inlined
 def _project_row(drum: Drum, rows: Array32) -> None:
-    """Distance of the points from the cylinder's axis, and column and row of it, as they are cut to integers."""
+    """Distance of the points from the cylinder's axis, and column and row of it, to be cut to integers."""
     T = drum.T_view_rig
     for i in range(rows.shape[1]):
         x = T[0, 0] * rows[_X, i] + T[0, 1] * rows[_Y, i] + T[0, 2] * rows[_Z, i] + T[0, 3]
@@ -431,85 +441,78 @@ def _azimuth(x: F32, y: F32) -> F32:
 
 
 @inlined
-def _address_row(
-    camera: int,
-    drum: Drum,
-    weights: Array32,
-    wide: int,
-    high: int,
-    kind: int,
-    rows: Array32,
-    addresses: I32,
-) -> None:
-    """The colour pixel and the window's cell of each point, and what is written there, as integers."""
+def _address_row(camera: int, drum: Drum, weights: Array32, rows: Array32, keys: U64, places: I32) -> None:
+    """Each point's cell of the window, and its key: distance, weight and room for colour; the least stays."""
     lines, columns = np.int32(drum.cells.shape[1]), np.int32(drum.cells.shape[2])
     start, circle, bottom = np.int32(drum.starts[camera]), np.int32(drum.circle), F32(drum.cells.shape[1])
-    right, below = F32(wide - 1), F32(high - 1)
-    shift = _ZERO if kind == BAYER else _HALF
     for x in range(weights.size):
-        u, v = rows[_U, x], rows[_V, x]
-        shown = (weights[x] > _ZERO) & (u >= _ZERO) & (u < right) & (v >= _ZERO) & (v < below)
-        addresses[_AT_U, x] = np.int32(min(max(u, _ZERO), right) + shift) if shown else np.int32(-1)
-        addresses[_AT_V, x] = np.int32(min(max(v, _ZERO), below) + shift)
         column = np.int32(rows[_COLUMN, x]) - start
         column = column + circle if column < 0 else column
         row = np.int32(min(max(rows[_ROW, x], -_ONE), bottom))
         drawn = (column < columns) & (row < lines) & (rows[_ROW, x] >= _ZERO)
-        addresses[_PLACE, x] = np.int32(row * columns + column) if drawn else np.int32(-1)
+        places[x] = np.int32(row * columns + column) if drawn else np.int32(-1)
         square = rows[_DISTANCE, x] * rows[_DISTANCE, x]  # undoes q⁴: both cameras of a seam are equally far
-        addresses[_UNITS, x] = np.int32(min(rows[_DISTANCE, x], F32(1e4)) * _UNITS_A_METRE)
-        addresses[_PART, x] = np.int32(min(max(weights[x] * square * square * _SHARE, _ONE), F32(255.0)))
+        part = np.int32(min(max(weights[x] * square * square * _SHARE, _ONE), F32(255.0)))
+        units = np.int32(min(rows[_DISTANCE, x], F32(1e4)) * _UNITS_A_METRE)
+        keys[x] = np.uint64(units) << np.uint64(32) | np.uint64(part) << np.uint64(24)
 
 
 @inlined
-def _unhidden(us: Array32, scan: int, addresses: I32) -> int:
+def _color_row(weights: Array32, wide: int, high: int, kind: int, rows: Array32, addresses: I32) -> None:
+    """Flat indices of the values that colour each point.
+
+    Any 2×2 pixels of a mosaic (GRBG) hold red, blue and two greens: those around a point are half a pixel off.
+    """
+    right, below, line = F32(wide - 1), F32(high - 1), np.int32(wide)
+    one = np.int32(1)
+    for x in range(weights.size):
+        u, v = rows[_U, x], rows[_V, x]
+        shown = (weights[x] > _ZERO) & (u >= _ZERO) & (u < right) & (v >= _ZERO) & (v < below)
+        shift = _ZERO if kind == BAYER else _HALF
+        column = np.int32(min(max(u, _ZERO), right) + shift)
+        row = np.int32(min(max(v, _ZERO), below) + shift)
+        place = np.int32(row * line + column)
+        if kind == BAYER:
+            odd_row, odd_column, mixed = row & one, column & one, (row ^ column) & one
+            red = place + odd_row * line + (one - odd_column)
+            blue = place + (one - odd_row) * line + odd_column
+            green, other = place + mixed, place + line + (one - mixed)
+        elif kind == BGR:
+            red, green, blue = 3 * place + 2, 3 * place + 1, 3 * place
+            other = green
+        else:
+            red = green = blue = other = place + 0
+        addresses[_RED, x] = np.int32(red) if shown else np.int32(-1)
+        addresses[_BLUE, x] = np.int32(blue)
+        addresses[_GREEN, x] = np.int32(green)
+        addresses[_OTHER_GREEN, x] = np.int32(other)
+
+
+@inlined
+def _unhidden(us: Array32, scan: int, ahead: Array32, addresses: I32) -> int:
     """List the columns of points that the colour camera sees; how many.
 
     Walking against the direction in which near things are shifted in the colour image, a point whose pixel
-    one has passed before is hidden there behind something nearer.
+    one of the 31 before it has passed is hidden there behind something nearer.
     """
-    width = us.size
-    farthest = F32(-1e9)
+    width, margin = us.size, _PASSED
+    first, second = ahead[0], ahead[1]
+    for x in range(width):
+        value = us[x] if scan > 0 else -us[width - 1 - x]
+        seen = addresses[_RED, x if scan > 0 else width - 1 - x] >= 0
+        first[margin + x] = value if seen else F32(-1e9)
+    for step in (1, 2, 4, 8):  # the largest of 2, 4, 8, 16 values up to this one
+        for x in range(margin, margin + width):
+            second[x] = max(first[x], first[x - step])
+        first, second = second, first
     kept = 0
-    for step in range(width):
-        x = step if scan > 0 else width - 1 - step
-        along = us[x] if scan > 0 else -us[x]
-        seen = (addresses[_AT_U, x] >= 0) & (along > farthest)
-        farthest = along if seen else farthest
-        addresses[_KEPT, kept] = x
-        kept += int(seen)
+    for x in range(width):
+        place = x if scan > 0 else width - 1 - x
+        along = us[place] if scan > 0 else -us[place]
+        passed = max(first[margin + x - 1], first[margin + x - 16])
+        addresses[_KEPT, kept] = place
+        kept += int((addresses[_RED, place] >= 0) & (along > passed))
     return kept
-
-
-@inlined
-def _color(image: U8, kind: int, u: np.int32, v: np.int32) -> tuple[np.uint8, np.uint8, np.uint8]:
-    """RGB at a pixel that has a right and a lower neighbour.
-
-    Any 2×2 pixels of a mosaic hold red, blue and two greens: those around a point are half a pixel off at most.
-    """
-    row, column = np.uint64(v), np.uint64(u)
-    if kind == BAYER:
-        odd_row, odd_column, mixed = row & _BIT, column & _BIT, (row ^ column) & _BIT
-        red = image[row + odd_row, column + (_BIT - odd_column)]
-        blue = image[row + (_BIT - odd_row), column + odd_column]
-        greens = np.uint16(image[row, column + mixed]) + np.uint16(image[row + _BIT, column + (_BIT - mixed)])
-        return red, np.uint8((greens + np.uint16(1)) >> np.uint16(1)), blue
-    if kind == BGR:
-        place = column * np.uint64(3)
-        return image[row, place + np.uint64(2)], image[row, place + _BIT], image[row, place]
-    return image[row, column], image[row, column], image[row, column]
-
-
-@inlined
-def _draw(cells: U64, addresses: I32, x: int, red: np.uint8, green: np.uint8, blue: np.uint8) -> None:
-    """Draw a point into its camera's window: distance, weight and colour in one number, the least stays."""
-    if addresses[_PLACE, x] >= 0:
-        place = np.uint64(addresses[_PLACE, x])
-        key = np.uint64(addresses[_UNITS, x]) << np.uint64(32) | np.uint64(addresses[_PART, x]) << np.uint64(
-            24
-        )
-        key |= np.uint64(red) << np.uint64(16) | np.uint64(green) << np.uint64(8) | np.uint64(blue)
-        cells[place] = min(cells[place], key)
 
 
 @compiled()

@@ -179,7 +179,7 @@ def _shared_views(grids: Sequence[PlacedGrid]) -> tuple[npt.NDArray[np.int64], n
     spans = np.zeros((len(grids), MAX_PARTNERS, grids[0].shape[0], 2), np.int64)
     for i, grid in enumerate(grids):
         points = grid.points(_RANGES_M, _BLOCK_PX)
-        masks = {j: other.sees(points).any(axis=0) for j, other in enumerate(grids) if j != i}
+        masks = {j: _any_of(other.sees(points)) for j, other in enumerate(grids) if j != i}
         by_share = sorted(
             (j for j in masks if masks[j].any()), key=lambda j: (-np.count_nonzero(masks[j]), j)
         )
@@ -191,12 +191,16 @@ def _shared_views(grids: Sequence[PlacedGrid]) -> tuple[npt.NDArray[np.int64], n
 
 def _spans(blocks: npt.NDArray[np.bool_], shape: tuple[int, int]) -> npt.NDArray[np.int64]:
     """First column and the one after the last (H,2) of the blocks that are set, each with its neighbours."""
-    rows = np.pad(blocks, ((1, 1), (0, 0)))
-    rows = rows[:-2] | rows[1:-1] | rows[2:]
+    padded = np.pad(blocks, ((1, 1), (0, 0)))
+    rows = _any_of(np.stack([padded[:-2], padded[1:-1], padded[2:]]))
     first = (rows.argmax(axis=1) - 1) * _BLOCK_PX
     last = (rows.shape[1] - rows[:, ::-1].argmax(axis=1) + 1) * _BLOCK_PX
-    spans = np.clip(np.stack([first, last], axis=1), 0, shape[1]) * rows.any(axis=1)[:, None]
+    spans = np.clip(np.stack([first, last], axis=1), 0, shape[1]) * _any_of(rows.T)[:, None]
     return np.asarray(np.repeat(spans, _BLOCK_PX, axis=0)[: shape[0]], dtype=np.int64)
+
+
+def _any_of(masks: npt.NDArray[np.bool_]) -> npt.NDArray[np.bool_]:
+    return np.asarray(masks.any(axis=0))
 
 
 def _lens_numbers(intrinsics: Intrinsics) -> tuple[float, ...]:
