@@ -252,7 +252,7 @@ def rate_sentences(results: Mapping[str, Any]) -> str:
     """Rate and memory."""
     one, two, growth = results["rates"]["1"], results["rates"]["2"], results["growth_kib_200_frames"]
     return f"""Twelve simulated Kinects, 640×480 raw disparity and Bayer, calibrated from {FRAMES} frames,
-to a cloud of {results["points"] / 1e6:.2f} million points and a panorama of 3000 columns with colour and depth:
+to a cloud of {results["points"] / 1e6:.2f} million points and a panorama of 3000 columns, colour and depth:
 **{two["best"]:.1f} panoramas a second** on two threads (the quickest of {REPEATS}; {two["median"]:.1f} by
 the median), {one["best"]:.1f} on one ({one["median"]:.1f}), of {one["cpu_ms"]:.0f} ms of processor time each.
 After {FLAT_FRAMES} more frames Python and NumPy hold {growth:.0f} KiB more than before."""
@@ -269,8 +269,9 @@ def error_sentences(results: Mapping[str, Any]) -> str:
 {results["farther_than_10_sigma"]:.2%} of the points are off by more than ten σ.
 
 Where two cameras have points in one cell of {CELL_M * 100:.0f} cm, their surfaces are
-**{fused[0]:.1f} mm** apart (median; 90 %: {fused[1]:.1f} mm; {fused[2]} cells, all on seams). Without arbitration
-it is {without:.1f} mm (90 %: {without_90:.1f} mm; {results["shared_cells_without"]} cells), and the cloud has
+**{fused[0]:.1f} mm** apart (median; 90 %: {fused[1]:.1f} mm; {fused[2]} cells, all on seams).
+Without arbitration it is {without:.1f} mm (90 %: {without_90:.1f} mm;
+{results["shared_cells_without"]} cells), and the cloud has
 {results["points_without_arbitration"] / 1e6:.2f} million points."""
 
 

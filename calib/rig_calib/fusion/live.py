@@ -21,7 +21,7 @@ from rig_calib.fusion.live_kernels import (
     Measured,
     Ring,
     Scratch,
-    blend_rows,
+    blend_columns,
     clean_depth,
     close_ranks,
     place_points,
@@ -37,7 +37,7 @@ from rig_protocol.poses import Pose, inverse
 
 Array32 = npt.NDArray[np.float32]
 
-_BAND_ROWS = 32  # of the panorama, blended by one thread at a time
+_BAND_COLUMNS = 128  # of the panorama, blended by one thread at a time
 _CLOUD = -1  # the work beside the bands
 _KIND = {2: GREY, 3: BGR}
 
@@ -197,10 +197,10 @@ class LiveFusion:
         size = self.cylinder.height, self.cylinder.width
         self._panorama = np.zeros((*size, 3), np.uint8)
         self._panorama_depth = np.full(size, np.nan, np.float32)
-        self._bands = range(0, size[0], _BAND_ROWS)
+        self._bands = range(0, size[1], _BAND_COLUMNS)
         self._scratches: SimpleQueue[tuple[Scratch, Array32]] = SimpleQueue()
         for _ in range(self.settings.threads):
-            self._scratches.put((_scratch(shape), np.zeros((6, size[1]), np.float32)))
+            self._scratches.put((_scratch(shape), np.zeros((6, size[0]), np.float32)))
 
     def _in_threads(self, work: Callable[[int], None], items: Iterable[int]) -> None:
         for _ in self._pool.map(work, items):
@@ -257,14 +257,14 @@ class LiveFusion:
         self._scratches.put((scratch, sums))
 
     def _finish(self, first: int) -> None:
-        """The cloud, or a band of rows of the panorama."""
+        """The cloud, or a band of columns of the panorama."""
         if first == _CLOUD:
             np.cumsum(self._counts, out=self._starts[1:])
             close_ranks(self._points, self._colors, self._capacity, self._counts)
             return
         scratch, sums = self._scratches.get()
-        last = min(first + _BAND_ROWS, len(self._panorama))
-        blend_rows(first, last, self._drum, self._present, sums, self._panorama, self._panorama_depth)
+        last = min(first + _BAND_COLUMNS, self.cylinder.width)
+        blend_columns(first, last, self._drum, self._present, sums, self._panorama, self._panorama_depth)
         self._scratches.put((scratch, sums))
 
 

@@ -63,14 +63,14 @@ class Scratch(NamedTuple):
     rows: Array32  # (16,W), see below
     addresses: I32  # (6,W), see below
     keys: U64  # (W,) distance and weight of a point, as they stand in a cell
-    ahead: Array32  # (2,W + 32) colour columns, with what lies before the first
+    ahead: Array32  # (2,W + 32) colour columns, and room before them
 
 
 # Rows of `Scratch.rows` ...
 _X, _Y, _Z, _U, _V, _OWNED, _DISTANCE, _COLUMN, _ROW = range(9)
 _TOTAL, _DX, _DY, _DZ, _DEPTH, _INVERSE, _WEIGHT = range(9, 16)
-# ... and of `Scratch.addresses`: a partner's pixel or a cell of the window, −1 for none; flat indices of a point's
-# red, blue and two green values, −1 for none; which columns are kept.
+# ... and of `Scratch.addresses`: a partner's pixel or a cell of the window, −1 for none; flat indices of a
+# point's red, blue and two green values, −1 for none; which columns are kept.
 _PLACE, _RED, _BLUE, _GREEN, _OTHER_GREEN, _KEPT = range(6)
 
 
@@ -93,7 +93,10 @@ class Ring(NamedTuple):
 
 
 class Drum(NamedTuple):
-    """The cylinder as the kernels need it; `starts` (C,) and `cells` (C,H,W') are every camera's window."""
+    """The cylinder as the kernels need it; `starts` (C,) and `cells` (C,W',H) are every camera's window.
+
+    A window is kept column by column, as the cameras of a ring, which stand upright, draw it row by row.
+    """
 
     T_view_rig: Array32  # (3,4)
     azimuth_left: F32
@@ -282,7 +285,7 @@ def place_points(
                 place = np.uint64(addresses[_PLACE, x])
                 key = np.uint64(red) << np.uint64(16) | np.uint64(green) << np.uint64(8) | np.uint64(blue)
                 cells[place] = min(cells[place], scratch.keys[x] | key)
-    return count
+    return int(count)
 
 
 @inlined
@@ -321,8 +324,9 @@ def _merge_row(camera: int, y: int, measured: Measured, ring: Ring, rows: Array3
         if other >= 0 and ring.spans[camera, k, y, 0] < ring.spans[camera, k, y, 1]:
             begin, end = np.uint64(ring.spans[camera, k, y, 0]), np.uint64(ring.spans[camera, k, y, 1])
             shape = measured.inverse.shape[1], measured.inverse.shape[2]
-            _partner_pixels(begin, end, ring.T_grid_rig[other], ring.lenses[other], shape, rows, places)
-            _add_partner(begin, end, other, other < camera, own, measured, ring, rows, places)
+            T, lens = ring.T_grid_rig[other], ring.lenses[other]
+            if _partner_pixels(begin, end, T, lens, shape, rows, places) > 0:
+                _add_partner(begin, end, other, other < camera, own, measured, ring, rows, places)
     _end_sums(np.uint64(first), np.uint64(last), rows)
 
 
@@ -351,8 +355,11 @@ def _partner_pixels(
     shape: tuple[int, int],
     rows: Array32,
     places: I32,
-) -> None:
-    """Flat index of the partner's depth pixel on which each point falls, −1 for none, and its depth there."""
+) -> int:
+    """Flat index of the partner's depth pixel on which each point falls, −1 for none, and its depth there.
+
+    Returns how many there are.
+    """
     height, width = np.int32(shape[0]), np.int32(shape[1])
     right, bottom = F32(width) - _HALF, F32(height) - _HALF
     # Read before the loop: the compiler cannot know that what the loop writes is not these tables.
@@ -362,6 +369,7 @@ def _partner_pixels(
     fx, fy, cx, cy, k1, k2, p1, p2, k3 = (
         lens[0], lens[1], lens[2], lens[3], lens[4], lens[5], lens[6], lens[7], lens[8],
     )  # fmt: skip
+    count = 0
     for i in range(begin, end):
         x, y, z = rows[_X, i], rows[_Y, i], rows[_Z, i]
         depth = max(t20 * x + t21 * y + t22 * z + t23, F32(0.05))
@@ -376,6 +384,8 @@ def _partner_pixels(
         row = np.int32(min(max(v + _HALF, _ZERO), bottom))
         rows[_DEPTH, i] = depth
         places[i] = np.int32(row * width + column) if seen else np.int32(-1)
+        count += int(seen)
+    return count
 
 
 @inlined
@@ -395,12 +405,12 @@ def _add_partner(
     for x in range(begin, end):  # apart from the next loop: gathers keep a loop from becoming vectors
         place = np.uint64(max(places[x], np.int32(0)))
         rows[_INVERSE, x] = inverse[place]
-        rows[_WEIGHT, x] = weights[place] if places[x] >= 0 else _ZERO
+        rows[_WEIGHT, x] = weights[place]
     x0, y0, z0 = ring.origins[other, 0], ring.origins[other, 1], ring.origins[other, 2]
     for x in range(begin, end):
         depth = rows[_DEPTH, x]
         away = _ONE / rows[_INVERSE, x] - depth
-        same = abs(away) < _SAME_SURFACE_M + _SAME_SURFACE_RATIO * depth
+        same = (places[x] >= 0) & (abs(away) < _SAME_SURFACE_M + _SAME_SURFACE_RATIO * depth)
         weight = rows[_WEIGHT, x] if same else _ZERO
         change = weight * away / depth
         rows[_TOTAL, x] += weight
@@ -443,14 +453,14 @@ def _azimuth(x: F32, y: F32) -> F32:
 @inlined
 def _address_row(camera: int, drum: Drum, weights: Array32, rows: Array32, keys: U64, places: I32) -> None:
     """Each point's cell of the window, and its key: distance, weight and room for colour; the least stays."""
-    lines, columns = np.int32(drum.cells.shape[1]), np.int32(drum.cells.shape[2])
-    start, circle, bottom = np.int32(drum.starts[camera]), np.int32(drum.circle), F32(drum.cells.shape[1])
+    columns, lines = np.int32(drum.cells.shape[1]), np.int32(drum.cells.shape[2])
+    start, circle, bottom = np.int32(drum.starts[camera]), np.int32(drum.circle), F32(drum.cells.shape[2])
     for x in range(weights.size):
         column = np.int32(rows[_COLUMN, x]) - start
         column = column + circle if column < 0 else column
         row = np.int32(min(max(rows[_ROW, x], -_ONE), bottom))
         drawn = (column < columns) & (row < lines) & (rows[_ROW, x] >= _ZERO)
-        places[x] = np.int32(row * columns + column) if drawn else np.int32(-1)
+        places[x] = np.int32(column * lines + row) if drawn else np.int32(-1)
         square = rows[_DISTANCE, x] * rows[_DISTANCE, x]  # undoes q⁴: both cameras of a seam are equally far
         part = np.int32(min(max(weights[x] * square * square * _SHARE, _ONE), F32(255.0)))
         units = np.int32(min(rows[_DISTANCE, x], F32(1e4)) * _UNITS_A_METRE)
@@ -461,7 +471,8 @@ def _address_row(camera: int, drum: Drum, weights: Array32, rows: Array32, keys:
 def _color_row(weights: Array32, wide: int, high: int, kind: int, rows: Array32, addresses: I32) -> None:
     """Flat indices of the values that colour each point.
 
-    Any 2×2 pixels of a mosaic (GRBG) hold red, blue and two greens: those around a point are half a pixel off.
+    Any 2×2 pixels of a mosaic (GRBG) hold red, blue and two greens: those around a point are half a
+    pixel off.
     """
     right, below, line = F32(wide - 1), F32(high - 1), np.int32(wide)
     one = np.int32(1)
@@ -495,82 +506,75 @@ def _unhidden(us: Array32, scan: int, ahead: Array32, addresses: I32) -> int:
     Walking against the direction in which near things are shifted in the colour image, a point whose pixel
     one of the 31 before it has passed is hidden there behind something nearer.
     """
-    width, margin = us.size, _PASSED
+    one, width, margin = np.uint64(1), np.uint64(us.size), np.uint64(_PASSED)
     first, second = ahead[0], ahead[1]
     for x in range(width):
-        value = us[x] if scan > 0 else -us[width - 1 - x]
-        seen = addresses[_RED, x if scan > 0 else width - 1 - x] >= 0
-        first[margin + x] = value if seen else F32(-1e9)
-    for step in (1, 2, 4, 8):  # the largest of 2, 4, 8, 16 values up to this one
+        place = x if scan > 0 else width - one - x
+        value = us[place] if scan > 0 else -us[place]
+        first[margin + x] = value if addresses[_RED, place] >= 0 else F32(-1e9)
+    for shift in (1, 4):  # the largest of 4, then of 16 values up to this one
+        step = np.uint64(shift)
         for x in range(margin, margin + width):
-            second[x] = max(first[x], first[x - step])
-        first, second = second, first
-    kept = 0
+            second[x] = max(
+                max(first[x], first[x - step]), max(first[x - step - step], first[x - step - step - step])
+            )
+        for x in range(margin, margin + width):
+            first[x] = second[x]
+    kept = np.uint64(0)
     for x in range(width):
-        place = x if scan > 0 else width - 1 - x
+        place = x if scan > 0 else width - one - x
         along = us[place] if scan > 0 else -us[place]
-        passed = max(first[margin + x - 1], first[margin + x - 16])
-        addresses[_KEPT, kept] = place
-        kept += int((addresses[_RED, place] >= 0) & (along > passed))
-    return kept
+        passed = max(first[margin + x - one], first[margin + x - np.uint64(16)])
+        addresses[_KEPT, kept] = np.int32(place)
+        kept += np.uint64((addresses[_RED, place] >= 0) & (along > passed))
+    return int(kept)
 
 
 @compiled()
-def blend_rows(
-    first: int, last: int, drum: Drum, present: U8, sums: Array32, color: U8, depth: Array32
+def blend_columns(
+    begin: int, end: int, drum: Drum, present: U8, sums: Array32, color: U8, depth: Array32
 ) -> None:
-    """Rows of the panorama: the weighted mean of the windows' front surfaces, BGR; NaN where there is none.
+    """Columns of the panorama: the weighted mean of the windows' front surfaces, BGR; NaN where is none.
 
-    `sums` (6,W) is scratch.
+    `sums` (6,H) is scratch.
     """
-    width = depth.shape[1]
-    for row in range(first, last):
+    for x in range(begin, end):
         sums[0], sums[1:] = F32(np.inf), _ZERO
         for step in range(2):  # all must have been looked at before the front is known
             for camera in range(drum.cells.shape[0]):
-                start, cells = drum.starts[camera], drum.cells[camera, row]
-                if present[camera]:
-                    # Beyond the border of a closed cylinder the window goes on at the other one.
-                    before = max(min(width - start, cells.size), 0)
-                    after = max(min(start + cells.size - drum.circle, width), 0)
-                    _take_window(step, cells[:before], sums, np.uint64(start))
-                    _take_window(step, cells[cells.size - after :], sums, np.uint64(0))
-        for x in range(width):
-            total = sums[1, x]
+                column = (x - drum.starts[camera]) % drum.circle
+                if present[camera] and column < drum.cells.shape[1]:
+                    if step == 0:
+                        _find_nearest(drum.cells[camera, column], sums)
+                    else:
+                        _add_window(drum.cells[camera, column], sums)
+        for y in range(depth.shape[0]):
+            total = sums[1, y]
             scale = _ONE / max(total, _ONE)
-            depth[row, x] = sums[2, x] * scale / _UNITS_A_METRE if total > _ZERO else F32(np.nan)
+            depth[y, x] = sums[2, y] * scale / _UNITS_A_METRE if total > _ZERO else F32(np.nan)
             for channel in range(3):
-                color[row, x, channel] = np.uint8(sums[5 - channel, x] * scale + _HALF)
+                color[y, x, channel] = np.uint8(sums[5 - channel, y] * scale + _HALF)
 
 
 @inlined
-def _take_window(step: int, cells: U64, sums: Array32, first: np.uint64) -> None:
-    if step == 0:
-        _find_nearest(cells, sums, first)
-    else:
-        _add_window(cells, sums, first)
+def _find_nearest(cells: U64, sums: Array32) -> None:
+    for y in range(cells.size):
+        sums[0, y] = min(sums[0, y], F32(np.uint32(cells[y] >> np.uint64(32))))
 
 
 @inlined
-def _find_nearest(cells: U64, sums: Array32, first: np.uint64) -> None:
-    for i in range(np.uint64(cells.size)):
-        distance = F32(np.uint32(cells[i] >> np.uint64(32)))
-        sums[0, first + i] = min(sums[0, first + i], distance)
-
-
-@inlined
-def _add_window(cells: U64, sums: Array32, first: np.uint64) -> None:
+def _add_window(cells: U64, sums: Array32) -> None:
     byte = np.uint64(255)
-    for i in range(np.uint64(cells.size)):
-        x, key = first + i, cells[i]
+    for y in range(cells.size):
+        key = cells[y]
         distance = F32(np.uint32(key >> np.uint64(32)))
-        shown = (distance <= _FRONT_RATIO * sums[0, x]) & (key != EMPTY)
+        shown = (distance <= _FRONT_RATIO * sums[0, y]) & (key != EMPTY)
         weight = F32(np.int32(key >> np.uint64(24) & byte)) if shown else _ZERO
-        sums[1, x] += weight
-        sums[2, x] += weight * distance
-        sums[3, x] += weight * F32(np.int32(key >> np.uint64(16) & byte))
-        sums[4, x] += weight * F32(np.int32(key >> np.uint64(8) & byte))
-        sums[5, x] += weight * F32(np.int32(key & byte))
+        sums[1, y] += weight
+        sums[2, y] += weight * distance
+        sums[3, y] += weight * F32(np.int32(key >> np.uint64(16) & byte))
+        sums[4, y] += weight * F32(np.int32(key >> np.uint64(8) & byte))
+        sums[5, y] += weight * F32(np.int32(key & byte))
 
 
 @compiled()

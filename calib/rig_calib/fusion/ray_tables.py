@@ -154,7 +154,7 @@ def drum_around(grids: Sequence[PlacedGrid], T_view_rig: Pose, cylinder: Cylinde
         slope_top=np.float32(cylinder.slope_top),
         circle=circle_px,
         starts=np.array([start for start, _ in windows], np.int64),
-        cells=np.full((len(grids), cylinder.height, width), EMPTY, np.uint64),
+        cells=np.full((len(grids), width, cylinder.height), EMPTY, np.uint64),
     )
 
 
