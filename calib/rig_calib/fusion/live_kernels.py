@@ -408,17 +408,23 @@ def _add_partner(
         rows[_WEIGHT, x] = weights[place]
     x0, y0, z0 = ring.origins[other, 0], ring.origins[other, 1], ring.origins[other, 2]
     for x in range(begin, end):
-        depth = rows[_DEPTH, x]
-        away = _ONE / rows[_INVERSE, x] - depth
-        same = (places[x] >= 0) & (abs(away) < _SAME_SURFACE_M + _SAME_SURFACE_RATIO * depth)
-        weight = rows[_WEIGHT, x] if same else _ZERO
-        change = weight * away / depth
-        rows[_TOTAL, x] += weight
-        rows[_DX, x] += change * (rows[_X, x] - x0)
-        rows[_DY, x] += change * (rows[_Y, x] - y0)
-        rows[_DZ, x] += change * (rows[_Z, x] - z0)
-        yields = (weight > own[x]) | ((weight == own[x]) & first_of_both)
+        away = _ONE / rows[_INVERSE, x] - rows[_DEPTH, x]
+        same = abs(away) < _SAME_SURFACE_M + _SAME_SURFACE_RATIO * rows[_DEPTH, x]
+        rows[_WEIGHT, x] = rows[_WEIGHT, x] if same & (places[x] >= 0) else _ZERO
+        rows[_DEPTH, x] = (
+            rows[_WEIGHT, x] * away / rows[_DEPTH, x]
+        )  # by how much of the ray, times the weight
+    for x in range(begin, end):
+        yields = (rows[_WEIGHT, x] > own[x]) | ((rows[_WEIGHT, x] == own[x]) & first_of_both)
         rows[_OWNED, x] = _ZERO if yields else rows[_OWNED, x]
+    for x in range(begin, end):
+        rows[_TOTAL, x] += rows[_WEIGHT, x]
+    for x in range(begin, end):
+        rows[_DX, x] += rows[_DEPTH, x] * (rows[_X, x] - x0)
+    for x in range(begin, end):
+        rows[_DY, x] += rows[_DEPTH, x] * (rows[_Y, x] - y0)
+    for x in range(begin, end):
+        rows[_DZ, x] += rows[_DEPTH, x] * (rows[_Z, x] - z0)
 
 
 @inlined
