@@ -244,8 +244,8 @@ def open3d_sentence(results: Mapping[str, Any]) -> str:
         return str(results["open3d_skipped"]) + "."
     return f"""Open3D in the same run, from images that are decoded and registered already, without cleaning,
 arbitration or panorama: {results["open3d_s"]:.2f} clouds a second by `create_from_rgbd_image`,
-`transform` and `+=` (live fusion is **{results["ratio_open3d"]:.1f} times** as fast),
-{results["open3d_tensor_s"]:.2f} by its tensor API ({results["ratio_open3d_tensor"]:.1f} times)."""
+`transform` and `+=` (live fusion is **{results["ratio_open3d"]:.2f} times** as fast),
+{results["open3d_tensor_s"]:.2f} by its tensor API ({results["ratio_open3d_tensor"]:.2f} times)."""
 
 
 def rate_sentences(results: Mapping[str, Any]) -> str:
