@@ -5,7 +5,8 @@ BIN    := $(VENV)/bin
 READY  := $(VENV)/.ready
 BENCH  := $(VENV)/.ready-bench
 
-.PHONY: demo test lint lint-deploy deploy-test arm64-test bench bench-codecs bench-transport bench-calibration bench-kinect soak \
+.PHONY: demo test lint lint-deploy deploy-test arm64-test bench bench-codecs bench-transport bench-calibration bench-fusion \
+	bench-kinect soak \
 	soak-agents fuzz docs clean
 
 demo: $(READY)  ## twelve simulated Kinects over loopback UDP, calibrated and fused into build/demo
@@ -50,12 +51,19 @@ bench-transport: $(BENCH) bench-codecs  ## the transport against its bars and it
 bench-calibration: $(BENCH)  ## the calibration against its bars, the bound and its peers, into docs/accuracy.md
 	$(BIN)/python tests/benchmarks/bench_calibration.py
 
+bench-fusion: $(READY) build/open3d  ## the live fusion against its bars and Open3D, into docs/performance.md
+	$(BIN)/python tests/benchmarks/bench_fusion.py
+
+# In a folder of its own: it brings a pytest plugin that the tests' settings refuse. Without it the bench skips it.
+build/open3d: $(READY)
+	-$(BIN)/python -m pip install --quiet --target $@ 'open3d>=0.19'
+
 bench-kinect: $(READY)  ## a Kinect on the virtual USB bus: cost, torn frames, a thousand replugs
 	$(BIN)/python tests/benchmarks/kinect_capture.py
 	$(BIN)/python tests/benchmarks/kinect_replug.py
 	$(BIN)/python tests/benchmarks/bench_kinect.py
 
-bench: bench-transport bench-calibration  ## all figures, into build/bench.json
+bench: bench-transport bench-calibration bench-fusion  ## all figures, into build/bench.json
 
 docs: $(READY)  ## the pages that are made from the code
 	$(BIN)/python docs/generate_configuration.py
