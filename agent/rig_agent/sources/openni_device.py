@@ -28,7 +28,7 @@ _REGISTRATION = 5  # a property of devices
 _MIRRORING = 7  # properties of streams
 _FOV = (1, 2)  # horizontal, vertical
 _AS_FAST_AS_READ = -1.0  # a playback speed
-_LAST_FRAME_S = 0.1  # three frames
+_LAST_FRAME_S = 0.3  # ten frames, on a machine that is busy
 
 
 @dataclass(frozen=True, slots=True, eq=False)
