@@ -6,7 +6,12 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 if TYPE_CHECKING:  # heavy: imported where they are used, so that --help is quick
+    from collections.abc import Mapping
+
     from rich.console import Console
+
+    from rig_calib.fusion.gains import Gain
+    from rig_calib.rig_calibration import RigCalibration
 
 Folder = Annotated[
     Path, typer.Argument(help="Rig folder (nominal.json, one subfolder a camera), or a recording FILE.mcap.")
@@ -43,6 +48,10 @@ def fuse(
     calibration: Annotated[Path, typer.Option(help="The calibration.json of this rig.")],
     out: Out,
     frames: Frames = None,
+    mesh: Annotated[bool, typer.Option("--mesh", help="Write mesh.ply and mesh.glb, too.")] = False,
+    voxel_mm: Annotated[float, typer.Option(min=2, max=100, help="Of the mesh: how fine it is.")] = 10.0,
+    workers: WorkerCount = None,
+    scheduler: Scheduler = None,
 ) -> None:
     """Fuse a rig folder or a recording with a calibration into cloud.ply and panorama.png."""
     from rich.console import Console
@@ -59,6 +68,39 @@ def fuse(
     console.print(f"{len(fused.cloud):,} points in {out / 'cloud.ply'}")
     for why in fused.cloud.skipped:
         console.print(why, style="yellow")
+    if mesh:
+        _fuse_mesh(console, folder, known, fused.gains, out, frames, voxel_mm * 1e-3, workers, scheduler)
+
+
+def _fuse_mesh(
+    console: "Console",
+    path: Path,
+    known: "RigCalibration",
+    gains: "Mapping[int, Gain]",
+    out: Path,
+    frames: int | None,
+    voxel_m: float,
+    workers: int | None,
+    scheduler: str | None,
+) -> None:
+    from rig_calib.offline.capture import open_capture
+    from rig_calib.offline.workers import open_workers
+    from rig_calib.outputs import MESH_GLB, MESH_PLY, write_mesh
+    from rig_calib.terminal import progress_bar
+    from rig_calib.tsdf.fusing import first_positions, fuse_capture
+
+    capture = open_capture(path)
+    positions = first_positions(capture, frames)
+    with progress_bar(console) as tell, open_workers(workers, scheduler) as hands:
+        volume = fuse_capture(
+            capture, positions, known, gains, voxel_m, hands, lambda share: tell("mesh", share)
+        )
+    made = write_mesh(out, volume, known)
+    rims, length_m = made.holes()
+    console.print(
+        f"{len(made.faces):,} triangles, {made.area_m2():.1f} m², in {out / MESH_PLY} and {MESH_GLB}; "
+        f"{rims} rims, {length_m:.0f} m together, where nothing was measured any more"
+    )
 
 
 def export(

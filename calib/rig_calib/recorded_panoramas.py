@@ -9,7 +9,8 @@ from rig_protocol.frames import EncodedFrame, PanoramicFrame
 from rig_protocol.recorded_sets import EncodedSet, with_frames
 from rig_protocol.recording import Recording
 
-_FRAMES = 5  # where nobody says how many: as many as `rig-server --calibrate` takes
+DEFAULT_FRAMES = 5
+"""Where nobody says how many: as many as `rig-server --calibrate` takes."""
 
 
 def is_recording(capture: Path) -> bool:
@@ -23,7 +24,7 @@ def recorded_panoramas(take: Path, frames: int | None = None) -> Iterator[Panora
     ConfigurationError when there are fewer, DataError for what is no recording or damaged.
     """
     recording = Recording(take)
-    cameras, found, wanted = recording.description.camera_ids, 0, frames or _FRAMES
+    cameras, found, wanted = recording.description.camera_ids, 0, frames or DEFAULT_FRAMES
     for one in with_frames(recording.entries()):
         held = [frame for camera_id in cameras if (frame := _whole(one, camera_id)) is not None]
         if len(held) == len(cameras):
