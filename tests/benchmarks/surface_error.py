@@ -54,7 +54,7 @@ from support.true_surfaces import (
 )
 
 ROOMS = {"bedroom": (3.3, 3.0, 2.6), "living room": (9.0, 3.5, 2.6)}
-AZIMUTHS_DEG = {"bedroom": 205.0, "living room": 205.0}
+AZIMUTHS_DEG = {"bedroom": 25.0, "living room": 115.0}
 CALIBRATION_FRAMES = 3
 FRAMES = (1, 10)
 VOXEL_M = 0.01

@@ -35,7 +35,10 @@ def mesh_picture(mesh: Mesh, T_rig_view: Pose, azimuth_deg: float) -> ImageU8:
     ceiling_m = float(np.percentile(points[:, 2], 99.9)) - _CEILING_M
     centre = points[mesh.faces].mean(axis=1)
     to_eye = towards * 3.2 * radius - centre
-    shown = ((normals * to_eye).sum(axis=1) > 0) & (centre[:, 2] < ceiling_m)
+    # What a rough wall that turns its back has of faces to the front would stand before the room as specks.
+    smooth = (mesh.normals() @ T_rig_view[:3, :3])[mesh.faces].mean(axis=1)
+    facing = ((normals * to_eye).sum(axis=1) > 0) & ((smooth * to_eye).sum(axis=1) > 0)
+    shown = facing & (centre[:, 2] < ceiling_m)
     used = np.unique(mesh.faces[shown])
     scale, left, top = fit_to_picture(across[used], up[used])
     corners = np.column_stack([across * scale + left, top - up * scale, depth]) * (_FINER, _FINER, 1.0)

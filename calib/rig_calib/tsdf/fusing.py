@@ -56,7 +56,10 @@ def fuse_capture(
     total: Volume | None = None
     work = partial(_volume, calibration, dict(gains), voxel_m, keys)
     for volume in workers.map(work, batches, lambda share: tell(first + (1 - first) * share)):
-        total = volume if total is None else total.plus(volume)
+        if total is None:
+            total = volume
+        else:
+            total.take(volume)
     return _not_empty(total)
 
 

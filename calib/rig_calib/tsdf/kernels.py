@@ -186,10 +186,11 @@ def _pixel(lens: F64, x: float, y: float) -> tuple[float, float]:
 
 @inlined
 def _between(inverse_depth: F32, left: int, top: int, right_share: float, low_share: float) -> float:
-    """Interpolated 1/z, in which planes are straight; 0 where one of the four pixels has none."""
+    """Interpolated 1/z, in which planes are straight; beside holes that of the nearest pixel, 0 for none."""
     a, b = float(inverse_depth[top, left]), float(inverse_depth[top, left + 1])
     c, d = float(inverse_depth[top + 1, left]), float(inverse_depth[top + 1, left + 1])
     if a <= 0.0 or b <= 0.0 or c <= 0.0 or d <= 0.0:
-        return 0.0
+        upper, lower = (a, c) if right_share < 0.5 else (b, d)
+        return upper if low_share < 0.5 else lower
     upper, lower = a + right_share * (b - a), c + right_share * (d - c)
     return upper + low_share * (lower - upper)

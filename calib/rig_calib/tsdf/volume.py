@@ -40,6 +40,7 @@ MAX_FRAMES = 10_000
 """Of which the weights' sums cannot flow over."""
 
 _CHUNKS = 16  # a thread's work is cut into so many: blocks before a camera cost more than those beside it
+_ROWS = 4096  # blocks whose doubles are held at a time
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -86,29 +87,29 @@ class Volume:
             for _ in in_threads(work, parts, threads):
                 pass
 
-    def plus(self, other: "Volume") -> "Volume":
-        """The volume that both make: that of all their images, where they have the same blocks.
+    def take(self, other: "Volume") -> None:
+        """Add another volume's sums: then this one is that of all images of both.
 
-        ValueError for another voxel, ConfigurationError for more blocks than MAX_BLOCKS.
+        ValueError for another voxel, or a block that is not among these.
         """
-        if other.voxel_m != self.voxel_m:
-            raise ValueError(f"voxels of {self.voxel_m} m and {other.voxel_m} m")
-        total = Volume.at(np.union1d(self.keys, other.keys), self.voxel_m)
-        for volume in (self, other):
-            rows = np.searchsorted(total.keys, volume.keys)
-            for field in Sums._fields:
-                getattr(total.sums, field)[rows] += getattr(volume.sums, field)
-        return total
+        rows = np.minimum(np.searchsorted(self.keys, other.keys), max(len(self) - 1, 0))
+        if other.voxel_m != self.voxel_m or not np.isin(other.keys, self.keys).all():
+            raise ValueError("a volume takes what has its voxel and blocks")
+        for field in Sums._fields:
+            getattr(self.sums, field)[rows] += getattr(other.sums, field)
 
     def _add_to_part(self, corners: Keys, camera: Camera, part: tuple[int, int]) -> None:
         integrate(*part, corners, self.voxel_m, camera, self.sums)
 
     def distances_m(self) -> npt.NDArray[np.float32]:
         """Mean signed distances (B,512), positive before surfaces; NaN of which nothing is known."""
-        weight = self.sums.weight
-        with np.errstate(invalid="ignore", divide="ignore"):
-            mean = self.sums.distance / (weight * UNITS_A_METRE)
-        return np.where(weight > 0, mean, np.nan).astype(np.float32)
+        mean = np.empty(self.sums.weight.shape, np.float32)
+        for first in range(0, len(self), _ROWS):
+            rows = slice(first, first + _ROWS)
+            weight = self.sums.weight[rows]
+            with np.errstate(invalid="ignore"):  # 0/0 is NaN
+                mean[rows] = self.sums.distance[rows] / (weight * UNITS_A_METRE)
+        return mean
 
 
 def blocks_near(images: Sequence[RangeImage], voxel_m: float) -> Keys:

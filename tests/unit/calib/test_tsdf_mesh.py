@@ -90,7 +90,8 @@ def test_a_surface_that_runs_through_voxels_is_closed_too() -> None:
 
 def test_rims_are_where_voxels_are_unknown_and_nowhere_else() -> None:
     volume, places = sphere_volume()
-    volume.sums.weight[places[..., 2] > 0.2] = 0
+    for sums in (volume.sums.weight, volume.sums.distance):
+        sums[places[..., 2] > 0.2] = 0
     mesh = extract_mesh(volume)
     rims = mesh.rims()
     assert len(rims)

@@ -101,8 +101,11 @@ def test_two_volumes_merge_to_the_bits_of_one() -> None:
     keys = blocks_near(ROOM, VOXEL_M)
     whole = volume_of(ROOM, keys=keys)
     first, second = volume_of(ROOM[:1], keys=keys), volume_of(ROOM[1:], keys=keys)
-    assert_same(first.plus(second), whole)
-    assert_same(second.plus(first), whole)
+    for parts in ((first, second), (second, first)):
+        total = Volume.at(keys, VOXEL_M)
+        for part in parts:
+            total.take(part)
+        assert_same(total, whole)
 
 
 def test_the_order_of_images_and_the_threads_change_no_bit() -> None:
@@ -115,10 +118,13 @@ def test_the_order_of_images_and_the_threads_change_no_bit() -> None:
 
 def test_volumes_of_different_places_merge_to_both() -> None:
     near, far = facing_plane(1.0), facing_plane(3.0)
-    both = volume_of([near]).plus(volume_of([far]))
+    both = Volume.at(np.union1d(blocks_near([near], VOXEL_M), blocks_near([far], VOXEL_M)), VOXEL_M)
+    for image in (near, far):
+        both.take(volume_of([image]))
     assert {1, 3} == set(np.rint(extract_mesh(both).vertices_m[:, 2]).astype(int))
-    with pytest.raises(ValueError, match="voxels"):
-        both.plus(volume_of([near], voxel_m=0.03))
+    for stranger in (volume_of([near], voxel_m=0.03), volume_of([facing_plane(5.0)])):
+        with pytest.raises(ValueError, match="its voxel and blocks"):
+            both.take(stranger)
 
 
 def test_every_voxel_that_a_cube_at_the_surface_needs_has_a_block() -> None:
