@@ -59,7 +59,10 @@ def fuse(
     from rig_calib.outputs import make_output_folder, write_fused
     from rig_calib.rig_calibration import RigCalibration
     from rig_calib.rig_folder_calibration import read_description, read_views
+    from rig_calib.tsdf.mesh_files import require_libraries
 
+    if mesh:
+        require_libraries()
     known = RigCalibration.load(calibration)
     views = read_views(folder, read_description(folder), frames)
     make_output_folder(out)

@@ -92,10 +92,7 @@ def write_fused(folder: Path, calibration: RigCalibration, views: Sequence[Camer
 
 
 def write_mesh(folder: Path, volume: Volume, calibration: RigCalibration) -> Mesh:
-    """Write mesh.ply and mesh.glb of a volume, small floating pieces left out.
-
-    ConfigurationError where the libraries for it are not installed.
-    """
+    """Write mesh.ply and mesh.glb of a volume, small floating pieces left out; needs the extra `mesh`."""
     mesh = extract_mesh(volume).without_small_pieces()
     write_mesh_ply(folder / MESH_PLY, mesh)
     write_mesh_glb(

@@ -71,9 +71,9 @@ def frames_of(view: CameraView, frame: int | None) -> list[int]:
     return [k for k in range(count) if frame is None or k == frame]
 
 
-def clean_disparity(view: CameraView, grid: DepthGrid, frames: Sequence[int]) -> tuple[Array, Array, Mask]:
-    """Mean disparity (H,W) of some frames, smoothed; cosines of incidence; which pixels hold a surface."""
-    disparity = smooth_disparity(mean_disparity([disparity_image(view, k) for k in frames]))
+def clean_disparity(grid: DepthGrid, measured: Array) -> tuple[Array, Array, Mask]:
+    """A disparity image (H,W) smoothed; cosines of incidence; which pixels hold a surface."""
+    disparity = smooth_disparity(measured)
     incidence = cos_incidence(grid, disparity)
     return disparity, incidence, solid_pixels(disparity, incidence)
 
@@ -89,7 +89,8 @@ def camera_surface(
     if not frames:
         raise ValueError(f"{view.name} has no colour with depth in frame {frame}")
     grid = depth_grid(view.model, view.depth_frame)
-    disparity, incidence, solid = clean_disparity(view, grid, frames)
+    measured = mean_disparity([disparity_image(view, k) for k in frames])
+    disparity, incidence, solid = clean_disparity(grid, measured)
     rows, columns = np.nonzero(solid)
     pixels = np.column_stack([columns, rows])
     points, depth_m = grid_points(grid, pixels, disparity[rows, columns], correction)

@@ -14,7 +14,6 @@ from rig_calib.fusion.voxels import voxel_index, voxel_keys
 from rig_calib.tsdf.kernels import SIDE
 from rig_calib.tsdf.mesh import Array, Index, Mesh
 from rig_calib.tsdf.volume import Volume
-from rig_protocol.errors import ConfigurationError
 from rig_protocol.frames import ImageU8
 
 Array32 = npt.NDArray[np.float32]
@@ -28,10 +27,7 @@ _NO_COLOR = 128
 
 
 def extract_mesh(volume: Volume) -> Mesh:
-    """The surface between voxels before and behind it, where all eight corners of a cube are known.
-
-    ConfigurationError where scikit-image is not installed.
-    """
+    """The surface between voxels before and behind it, where all eight corners of a cube are known."""
     vertices, faces, first = [np.empty((0, 3))], [np.empty((0, 3), np.int64)], 0
     for tile_vertices, tile_faces in _tiles(volume):
         vertices.append(tile_vertices)
@@ -43,10 +39,8 @@ def extract_mesh(volume: Volume) -> Mesh:
 
 def _tiles(volume: Volume) -> Iterator[tuple[Array, Index]]:
     """Vertices (n,3), in voxels, and faces (m,3) of every tile: those of cubes that begin in it."""
-    try:
-        from skimage.measure import marching_cubes
-    except ImportError as error:
-        raise ConfigurationError("a mesh needs scikit-image: pip install 'kinect-rig[mesh]'") from error
+    from skimage.measure import marching_cubes
+
     blocks, distances = voxel_index(volume.keys), volume.distances_m()
     rows = {tuple(block): row for row, block in enumerate(blocks.tolist())}
     least_m = _LEAST_SHARE * volume.voxel_m

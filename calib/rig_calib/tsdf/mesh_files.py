@@ -1,5 +1,6 @@
 """Mesh files: PLY as it is, in the rig frame; GLB upright, as glTF has it."""
 
+import importlib.util
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -21,6 +22,15 @@ _T_GLTF_VIEW = np.array(
 _UNLIT = "KHR_materials_unlit"
 
 
+def require_libraries() -> None:
+    """ConfigurationError, with what to install, where meshes can be neither made nor written."""
+    for name in ("skimage", "trimesh"):
+        if importlib.util.find_spec(name) is None:
+            raise ConfigurationError(
+                f"a mesh needs the Python package {name}: pip install 'kinect-rig[mesh]'"
+            )
+
+
 def write_mesh_ply(path: Path, mesh: Mesh) -> None:
     """Binary PLY with normals and colours, in metres of the rig frame; the file whole or not at all."""
     from trimesh.exchange.ply import export_ply
@@ -34,13 +44,12 @@ def write_mesh_glb(path: Path, mesh: Mesh, T_rig_view: Pose) -> None:
     The vertices are those of the rig frame; the node turns the view's up to +Y and its front to +Z. Colours
     are linear, as glTF asks, and unlit: the photographed light is in them already.
     """
-    surface = _trimesh(mesh, _linear(mesh.colors))
     import trimesh
     from trimesh.exchange.gltf import export_glb
 
     scene = trimesh.Scene()
     scene.add_geometry(
-        surface,
+        _trimesh(mesh, _linear(mesh.colors)),
         node_name="rig",
         geom_name="surface",
         transform=_T_GLTF_VIEW @ inverse(T_rig_view),
@@ -49,10 +58,8 @@ def write_mesh_glb(path: Path, mesh: Mesh, T_rig_view: Pose) -> None:
 
 
 def _trimesh(mesh: Mesh, colors: ImageU8) -> "trimesh.Trimesh":
-    try:
-        import trimesh
-    except ImportError as error:
-        raise ConfigurationError("a mesh needs trimesh: pip install 'kinect-rig[mesh]'") from error
+    import trimesh
+
     return trimesh.Trimesh(
         vertices=mesh.vertices_m,
         faces=mesh.faces,

@@ -6,7 +6,8 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from rig_calib.depth_model import DepthGrid, depth_grid, depth_sigma_m, grid_points
+from rig_calib.depth_model import DepthGrid, depth_grid, depth_sigma_m, disparity_image, grid_points
+from rig_calib.fusion.cleaning import bridge_gaps, mean_disparity
 from rig_calib.fusion.gains import NO_GAIN, Gain
 from rig_calib.fusion.sampling import mean_color, sample_image
 from rig_calib.fusion.surface import clean_disparity, frames_of
@@ -55,7 +56,8 @@ def range_image(view: CameraView, camera: CalibratedCamera, gain: Gain = NO_GAIN
     """The mean of a view's frames at the calibrated camera's place; DataError for what makes no image."""
     frames = frames_of(view, None)
     grid = depth_grid(view.model, view.depth_frame)
-    disparity, incidence, solid = clean_disparity(view, grid, frames)
+    measured = bridge_gaps(mean_disparity([disparity_image(view, k) for k in frames]))
+    disparity, incidence, solid = clean_disparity(grid, measured)
     solid = solid & np.isfinite(pixel_rays(grid.intrinsics)).all(axis=-1)
     rows, columns = np.nonzero(solid)
     at = np.column_stack([columns, rows])

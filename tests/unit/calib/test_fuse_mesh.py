@@ -1,5 +1,6 @@
 """From a capture to mesh.ply and mesh.glb: the same whoever works on it; clear words where it cannot be."""
 
+import pickle
 import sys
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
@@ -46,13 +47,17 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return write_capture(tmp_path_factory.mktemp("capture"))
 
 
-class Backwards(ThisProcess):
-    """Workers of whom the last batch is ready first."""
+class Elsewhere(ThisProcess):
+    """Workers who are sent everything as bytes, and whose last batch is ready first."""
 
     def map(
         self, work: Callable[[Batch], Result], batches: Sequence[Batch], tell: Tell | None = None
     ) -> Iterator[Result]:
-        return iter(list(super().map(work, batches[::-1], tell)))
+        def sent(batch: Batch) -> Result:
+            there, that = pickle.loads(pickle.dumps((work, batch)))  # noqa: S301 - our own bytes
+            return pickle.loads(pickle.dumps(there(that)))  # type: ignore[no-any-return]  # noqa: S301
+
+        return iter(list(super().map(sent, batches[::-1], tell)))
 
 
 def fused(folder: Path, workers: ThisProcess, told: list[float] | None = None) -> Volume:
@@ -71,7 +76,7 @@ def run(monkeypatch: pytest.MonkeyPatch, *words: object) -> int:
 def test_batches_in_any_order_give_the_same_bits(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(fusing, "FRAMES_A_BATCH", 2)
     told: list[float] = []
-    one, other = fused(folder, ThisProcess(), told), fused(folder, Backwards())
+    one, other = fused(folder, ThisProcess(), told), fused(folder, Elsewhere())
     np.testing.assert_array_equal(one.keys, other.keys)
     for own, others in zip(one.sums, other.sums, strict=True):
         np.testing.assert_array_equal(own, others)
@@ -112,6 +117,17 @@ def test_without_mesh_none_is_written(folder: Path, tmp_path: Path, monkeypatch:
     words = ("--calibration", folder / "calibration.json", "--out", tmp_path)
     assert run(monkeypatch, "fuse", folder, *words) == 0
     assert sorted(path.name for path in tmp_path.iterdir()) == ["cloud.ply", "panorama.png"]
+
+
+def test_a_library_that_is_missing_is_named_before_any_work(
+    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setitem(sys.modules, "skimage", None)
+    out = tmp_path / "out"
+    words = ("--calibration", folder / "calibration.json", "--out", out, "--mesh")
+    assert run(monkeypatch, "fuse", folder, *words) == 2
+    assert "pip install 'kinect-rig[mesh]'" in " ".join(capsys.readouterr().err.split())
+    assert not out.exists()
 
 
 def test_a_capture_without_depth_has_no_surface_and_is_told_so(

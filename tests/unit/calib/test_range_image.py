@@ -5,7 +5,9 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from rig_calib.depth_model import DISPARITY_SIGMA, DepthCorrection
+from rig_calib.depth_model import DISPARITY_SIGMA, DepthCorrection, depth_grid
+from rig_calib.fusion.cleaning import bridge_gaps
+from rig_calib.fusion.surface import clean_disparity
 from rig_calib.rig_calibration import CalibratedCamera
 from rig_calib.tsdf.range_image import range_image, range_images
 from support.box_room import BoxRoom, calibration_of, ring_poses, with_noise
@@ -58,3 +60,27 @@ def test_cameras_that_give_nothing_are_named_with_the_reason() -> None:
         "cam01: left out, it delivered no colour with depth",
         "cam05: left out, the calibration could not place it",
     )
+
+
+def test_single_pixels_without_depth_are_bridged_along_planes_and_holes_stay() -> None:
+    rows, columns = np.indices((30, 40)).astype(np.float64)
+    plane = 500 + 4.0 * columns - 2.5 * rows
+    torn = plane.copy()
+    torn[10, 10] = torn[20, 31] = np.nan
+    torn[14:17, 20:23] = np.nan
+    bridged = bridge_gaps(torn)
+    hole = np.zeros(plane.shape, np.bool_)
+    hole[14:17, 20:23] = True
+    np.testing.assert_allclose(bridged[~hole], plane[~hole])
+    assert np.isnan(bridged[hole]).sum() == 9
+
+
+def test_nothing_is_bridged_between_two_surfaces_that_is_not_taken_out_again() -> None:
+    step = np.where(np.arange(60) < 30, 700.0, 600.0) * np.ones((60, 1))
+    step[:, 30] = np.nan  # what the near surface hides from the projector
+    bridged = bridge_gaps(step)
+    grid = depth_grid(VIEW.model, "color")
+    solid = clean_disparity(grid, bridged)[2]
+    assert not (np.abs(bridged[solid] - 650) < 40).any()
+    assert solid[:, :25].any()
+    assert solid[:, 35:].any()
