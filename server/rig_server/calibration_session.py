@@ -10,6 +10,7 @@ from rig_protocol.frames import PanoramicFrame
 from rig_protocol.troubleshooting import Topic
 from rig_server.calibration_run import CalibrationRun, Candidate
 from rig_server.calibration_task import CalibrationTask
+from rig_server.capture_log import CaptureLog
 from rig_server.config import MAX_SETS
 from rig_server.rig import Rig
 from rig_server.session_view import Phase, SessionView
@@ -33,6 +34,11 @@ class CalibrationSession:
         self._run: CalibrationRun | None = None
         self._given_up: CalibrationRun | None = None
         self._message: str | None = None
+        self._looked_on: CaptureLog | None = None
+
+    def look_on(self, log: CaptureLog) -> None:
+        """Show a calibration that others make, which can then be neither started nor decided on here."""
+        self._looked_on = log
 
     def start(self, camera: str | None = None, coached: bool = False, frames: int | None = None) -> None:
         """Begin; `camera` (name or id): find only this one anew, against the calibration in force.
@@ -94,7 +100,9 @@ class CalibrationSession:
     @property
     def view(self) -> SessionView:
         """What it is at."""
-        run = self._run
+        run, looked_on = self._run, self._looked_on
+        if looked_on is not None:
+            return looked_on.view
         return SessionView(message=self._message) if run is None else run.log.view
 
     @property
@@ -110,11 +118,16 @@ class CalibrationSession:
             self._given_up.join(_PATIENCE_S)
 
     def _refuse_while_busy(self) -> None:
+        self._refuse_on_looking()
         phase = self.view.phase
         if phase in _RUNNING:
             raise RigError("a calibration is running: wait for it, or cancel it")
         if phase is Phase.READY:
             raise RigError("a calibration is ready: accept or reject it first")
+
+    def _refuse_on_looking(self) -> None:
+        if self._looked_on is not None:
+            raise RigError("this server was started to calibrate once: it writes the result by itself")
 
     def _task(self, camera: str | None, coached: bool, frames: int | None) -> CalibrationTask:
         settings = self._rig.settings
@@ -137,6 +150,7 @@ class CalibrationSession:
         return CalibrationTask.one_camera(settings, known, camera, coached)
 
     def _ready(self) -> tuple[CalibrationRun, Candidate]:
+        self._refuse_on_looking()
         run = self._run
         if run is None or run.candidate is None:
             raise RigError("no calibration is ready: there is nothing to accept or reject")

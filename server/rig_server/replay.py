@@ -196,7 +196,7 @@ class ReplayedRig:
 
 
 def _calibration_of(recording: Recording) -> RigCalibration | None:
-    """The one that the take brings, if this release can read it: its images are worth playing all the same."""
+    """The one that the take brings; one that cannot be read is no reason not to play its images."""
     try:
         return recorded_calibration(recording)
     except DataError as error:
