@@ -23,7 +23,8 @@ from rig_server.config import CaptureSettings, RigSettings, SynchroniserSettings
 from rig_server.metrics import RigStatus
 from rig_server.offered_sets import OfferedSets
 from rig_server.receiver import rig_time_ns
-from support.scripted_estimates import ScriptedEstimates, calibration_of
+from support.box_room import calibration_of
+from support.scripted_estimates import ScriptedEstimates
 
 CAMERAS = (0, 1)
 RAW = np.full((2, 2), 900, np.uint16)
