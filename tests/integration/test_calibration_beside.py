@@ -53,7 +53,6 @@ def test_a_rig_is_calibrated_while_it_runs_on_and_its_take_brings_the_result(tmp
     assert truth is not None
     absolute = evaluate(accepted, truth).absolute
     assert absolute is not None
-    print(absolute.max)
     assert absolute.max.deg < 1.0  # two sets of a partial ring; the accuracy is measured elsewhere
     assert absolute.max.mm < 30.0
     take = tmp_path / "takes/hall.mcap"
