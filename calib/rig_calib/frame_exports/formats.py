@@ -10,10 +10,14 @@ from rig_protocol.errors import ConfigurationError
 
 @dataclass(frozen=True, slots=True)
 class FrameFormat:
-    """A module of this package that has `export`; `suffix` of the one file, or None where it is a folder."""
+    """A module of this package that has `export`; `suffix` of the one file, or None where it is a folder.
+
+    `extra`: the one of kinect-rig that its library comes with.
+    """
 
     module: str
     suffix: str | None
+    extra: str = "exports"
 
     def exporter(self) -> Exporter:
         """Its function; ConfigurationError names the extra where its library is not installed."""
@@ -21,9 +25,14 @@ class FrameFormat:
             exporter: Exporter = import_module(f"rig_calib.frame_exports.{self.module}").export
         except ModuleNotFoundError as error:
             raise ConfigurationError(
-                f"this format needs the Python package {error.name}: pip install 'kinect-rig[exports]'"
+                f"this format needs the Python package {error.name}: pip install 'kinect-rig[{self.extra}]'"
             ) from error
         return exporter
 
 
-FORMATS: Mapping[str, FrameFormat] = {}
+FORMATS: Mapping[str, FrameFormat] = {
+    "foxglove": FrameFormat("foxglove", ".mcap"),
+    "rerun": FrameFormat("rerun", ".rrd", extra="rerun"),
+    "tum": FrameFormat("tum", None),
+    "rig-folder": FrameFormat("rig_folder", None),
+}
