@@ -19,7 +19,12 @@ from rig_calib.rig_calibration import RigCalibration
 from rig_protocol.frames import DepthFrame, ImageU8, ImageU16, PanoramicFrame
 from rig_protocol.rig_folder import RigDescription
 
-JPEG_QUALITY = 95
+JPEG = (
+    cv2.IMWRITE_JPEG_QUALITY,
+    95,
+    cv2.IMWRITE_JPEG_SAMPLING_FACTOR,
+    cv2.IMWRITE_JPEG_SAMPLING_FACTOR_444,
+)
 """Viewers must decode twelve streams at once; who needs every bit takes TUM's folders or a rig folder."""
 
 CLOUD_VOXEL_M = 0.02
@@ -96,4 +101,4 @@ def _shown_cameras(
 
 
 def _jpeg(image: ImageU8) -> bytes:
-    return bytes(cv2.imencode(".jpg", image, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])[1])
+    return bytes(cv2.imencode(".jpg", image, JPEG)[1])
