@@ -1,13 +1,12 @@
 """Batches of a capture fused, whichever process has them: what comes out is the same."""
 
-import hashlib
-import json
 import os
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import asdict
 from threading import Lock
 
+from rig_calib.frame_exports.content_hash import content_hash
 from rig_calib.fusion.live import FusedFrame, LiveFusion, LiveFusionSettings
 from rig_calib.offline.capture import Capture
 from rig_calib.offline.workers import Batch
@@ -47,7 +46,7 @@ def borrowed_fusion(
         "models": {camera_id: model.to_dict() for camera_id, model in models.items()},
         "settings": asdict(chosen),
     }
-    key = hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
+    key = content_hash(content)
     fusion = _taken(key) or LiveFusion(calibration, models, chosen)
     try:
         yield fusion
