@@ -45,8 +45,8 @@ _EXPORT_EXAMPLES = """
 
 def fuse(
     folder: Folder,
-    calibration: Annotated[Path, typer.Option(help="The calibration.json of this rig.")],
     out: Out,
+    calibration: Calibration = None,
     frames: Frames = None,
     mesh: Annotated[bool, typer.Option("--mesh", help="Write mesh.ply and mesh.glb, too.")] = False,
     voxel_mm: Annotated[float, typer.Option(min=2, max=100, help="Of the mesh: how fine it is.")] = 10.0,
@@ -57,13 +57,13 @@ def fuse(
     from rich.console import Console
 
     from rig_calib.outputs import make_output_folder, write_fused
-    from rig_calib.rig_calibration import RigCalibration
+    from rig_calib.recorded_calibration import calibration_for
     from rig_calib.rig_folder_calibration import read_description, read_views
     from rig_calib.tsdf.mesh_files import require_libraries
 
     if mesh:
         require_libraries()
-    known = RigCalibration.load(calibration)
+    known = calibration_for(folder, calibration)
     views = read_views(folder, read_description(folder), frames)
     make_output_folder(out)
     fused = write_fused(out, known, views)
@@ -202,10 +202,12 @@ def _export_frames(
     from rig_calib.terminal import progress_bar
     from rig_protocol.errors import ConfigurationError
 
-    exporter, capture = FORMATS[form].exporter(), open_capture(path)
+    chosen_format = FORMATS[form]
+    exporter, capture = chosen_format.exporter(), open_capture(path)
     positions = range(*chosen.indices(len(capture.marks)))
     if not positions:
         raise ConfigurationError(f"{path} holds {len(capture.marks)} panoramic frames: none is left")
+    chosen_format.check(out, len(positions))
     known = capture.calibration if calibration is None else RigCalibration.load(calibration)
     with progress_bar(console) as tell, open_workers(workers, scheduler) as hands:
         exported = exporter(

@@ -4,6 +4,7 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from rig_calib.recorded_calibration import recorded_calibration
 from rig_calib.recorded_panoramas import is_recording
 from rig_calib.rig_calibration import RigCalibration
 from rig_calib.rig_folder_calibration import read_description
@@ -11,7 +12,7 @@ from rig_protocol.decoding import decode_frame
 from rig_protocol.errors import ConfigurationError
 from rig_protocol.frames import EncodedFrame, PanoramicFrame, RgbdFrame
 from rig_protocol.recorded_sets import EncodedSet, with_frames
-from rig_protocol.recording import CALIBRATION, Recording
+from rig_protocol.recording import Recording
 from rig_protocol.rig_folder import RigDescription, frame_indices, read_frame
 
 
@@ -53,8 +54,7 @@ def open_capture(path: Path) -> Capture:
     if is_recording(path):
         recording = Recording(path)
         marks = tuple(FrameMark(one.index, one.time_ns) for one in with_frames(recording.entries()))
-        if CALIBRATION in recording.attachments:
-            calibration = RigCalibration.from_dict(recording.document(CALIBRATION))
+        calibration = recorded_calibration(recording)
     else:
         held = (frame_indices(path, camera.name) for camera in description.cameras)
         marks = tuple(FrameMark(index, 0) for index in sorted({i for own in held for i in own}))
