@@ -20,6 +20,7 @@ from rig_protocol.errors import ConfigurationError, DataError
 from rig_protocol.frames import RgbdFrame
 from rig_protocol.rig_folder import CameraEntry, RigDescription, RingDrawing, write_rig_folder
 from support.box_room import MODEL, BoxRoom, calibration_of, ring_poses
+from support.box_takes import box_calibration, box_description, box_panorama, write_take
 
 POSES = ring_poses(3)
 CALIBRATION = calibration_of(POSES)
@@ -111,6 +112,20 @@ def test_the_command_writes_both_files_of_the_room(
     upright = trimesh.load_scene(tmp_path / "mesh.glb").to_geometry()
     half_m = BoxRoom().half_size_m
     assert abs(upright.bounds[:, 1]).max() == pytest.approx(half_m[2], abs=0.05)  # y is up in glTF
+
+
+def test_a_take_gives_a_mesh_by_the_calibration_that_it_carries(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    take = write_take(
+        tmp_path / "take.mcap", box_description(), [box_panorama(k) for k in range(2)], box_calibration()
+    )
+    assert run(monkeypatch, "fuse", take, "--out", tmp_path / "out", "--mesh", "--workers", 1) == 0
+    mesh = trimesh.load_mesh(tmp_path / "out" / "mesh.ply", process=False)
+    assert len(mesh.faces) > 10_000
+    assert np.median(BoxRoom().wall_error_m(mesh.vertices)) < 3e-3  # disparity was rounded to whole steps
+    expected = BoxRoom().colors(mesh.vertices) - 2.5  # the second of two frames is 5 darker
+    assert np.median(np.abs(mesh.visual.vertex_colors[:, :3] - expected)) < 2
 
 
 def test_without_mesh_none_is_written(folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -1,11 +1,14 @@
 """The volume: right distances, noise weighed, space seen through freed; the same bits in any order."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 
+import cv2
 import numpy as np
 import pytest
 
 from rig_calib.fusion.voxels import voxel_keys
+from rig_calib.projection import pixel_rays
 from rig_calib.tsdf import volume as volumes
 from rig_calib.tsdf.extraction import extract_mesh
 from rig_calib.tsdf.kernels import SIDE
@@ -13,7 +16,7 @@ from rig_calib.tsdf.mesh import Mesh
 from rig_calib.tsdf.range_image import RangeImage
 from rig_calib.tsdf.volume import Volume, blocks_near
 from rig_protocol.errors import ConfigurationError
-from support.box_room import BoxRoom, ring_poses
+from support.box_room import CAMERA, BoxRoom, ring_poses
 from support.range_images import KINECT_SIGMA_1M, facing_plane, room_images
 
 VOXEL_M = 0.02
@@ -95,6 +98,22 @@ def test_holes_in_the_depth_stay_open() -> None:
     mesh = mesh_of([image])
     x, y = mesh.vertices_m[:, 0] / 1.5 * 131 + 79.5, mesh.vertices_m[:, 1] / 1.5 * 131 + 59.5
     assert not ((x > 62) & (x < 98) & (y > 52) & (y < 68)).any()
+
+
+def test_a_distorting_depth_lens_bends_nothing() -> None:
+    lens = replace(CAMERA, dist=(0.08, -0.05, 0.002, -0.001, 0.01))
+    K = np.array([[lens.fx, 0, lens.cx], [0, lens.fy, lens.cy], [0, 0, 1]])
+    rays = pixel_rays(lens)
+    image = facing_plane(2.0)
+    image.incidence[:] = 1 / np.hypot(1, np.linalg.norm(rays, axis=2))
+    image.inverse_depth[:, :100] = 0  # the border of what is measured is a column of the image
+    mesh = mesh_of([replace(image, grid=replace(image.grid, intrinsics=lens))])
+    assert np.abs(mesh.vertices_m[:, 2] - 2.0).max() < 1e-4
+    border = np.array([[[100.0, row]] for row in (20, 60, 100)])
+    for x, y in 2.0 * cv2.undistortPoints(border, K, np.array(lens.dist))[:, 0]:
+        level = np.abs(mesh.vertices_m[:, 1] - y) < VOXEL_M
+        leftmost = mesh.vertices_m[level, 0].min()
+        assert abs(leftmost - x) < 1.5 * VOXEL_M  # a cube is there or not
 
 
 def test_two_volumes_merge_to_the_bits_of_one() -> None:
