@@ -64,43 +64,32 @@ def truncation_m(sigma_1m: float, depth_m: float, voxel_m: float) -> float:
 
 @compiled()
 def list_blocks(
-    inverse_depth: F32, rays: F64, T_rig_grid: F64, sigma_1m: float, voxel_m: float, steps: int, keys: I64
+    inverse_depth: F32, rays: F64, origin: F64, sigma_1m: float, voxel_m: float, steps: int, keys: I64
 ) -> int:
     """Write the keys of blocks within the truncation of what was measured, often twice; how many.
 
-    `rays` (H,W,2) are tangents; `steps` points on each are looked at, each widened by two voxels.
+    `rays` (H,W,3), of z = 1 in the grid's frame, are turned to the rig's, as is `origin` (3,). `steps` points
+    on each are looked at, each widened by two voxels.
     """
     count, block_m, reach_m = 0, SIDE * voxel_m, _BAND_VOXELS * voxel_m
     height, width = inverse_depth.shape
-    R = T_rig_grid
     for y in range(0, height, STRIDE_PX):
         for step in range(steps):
             share = 2.0 * step / (steps - 1) - 1.0
             for corner in range(8):
-                off_x = reach_m if corner & 1 else -reach_m
-                off_y = reach_m if corner & 2 else -reach_m
-                off_z = reach_m if corner & 4 else -reach_m
+                x0 = origin[0] + (reach_m if corner & 1 else -reach_m)
+                y0 = origin[1] + (reach_m if corner & 2 else -reach_m)
+                z0 = origin[2] + (reach_m if corner & 4 else -reach_m)
                 last = np.int64(-1)
                 for x in range(0, width, STRIDE_PX):
                     if inverse_depth[y, x] <= 0.0:
                         continue
-                    z = 1.0 / inverse_depth[y, x]
-                    z += share * truncation_m(sigma_1m, z, voxel_m)
-                    a, b = rays[y, x, 0] * z, rays[y, x, 1] * z
-                    i = np.int64(
-                        np.floor((R[0, 0] * a + R[0, 1] * b + R[0, 2] * z + R[0, 3] + off_x) / block_m)
-                    )
-                    j = np.int64(
-                        np.floor((R[1, 0] * a + R[1, 1] * b + R[1, 2] * z + R[1, 3] + off_y) / block_m)
-                    )
-                    k = np.int64(
-                        np.floor((R[2, 0] * a + R[2, 1] * b + R[2, 2] * z + R[2, 3] + off_z) / block_m)
-                    )
-                    key = (
-                        (i + _HALF_BLOCKS) << (2 * KEY_BITS)
-                        | (j + _HALF_BLOCKS) << KEY_BITS
-                        | (k + _HALF_BLOCKS)
-                    )
+                    depth = 1.0 / inverse_depth[y, x]
+                    depth += share * truncation_m(sigma_1m, depth, voxel_m)
+                    i = _cell(x0 + rays[y, x, 0] * depth, block_m)
+                    j = _cell(y0 + rays[y, x, 1] * depth, block_m)
+                    k = _cell(z0 + rays[y, x, 2] * depth, block_m)
+                    key = i << (2 * KEY_BITS) | j << KEY_BITS | k  # as voxel_keys has it
                     if key != last:
                         keys[count] = key
                         count += 1
@@ -108,30 +97,37 @@ def list_blocks(
     return count
 
 
+@inlined
+def _cell(place_m: float, block_m: float) -> np.int64:
+    return np.int64(np.floor(place_m / block_m)) + np.int64(_HALF_BLOCKS)
+
+
 @compiled()
 def integrate(first: int, last: int, corners: I64, voxel_m: float, camera: Camera, sums: Sums) -> None:
     """Add what a range image says of blocks `first` to `last`; their lowest voxels are `corners` (B,3)."""
-    T, radius = camera.T_grid_rig, 0.5 * np.sqrt(3.0) * SIDE * voxel_m
-    widest = np.sqrt(camera.widest)
-    half = 0.5 * (SIDE - 1) * voxel_m
+    T, widest = camera.T_grid_rig, np.sqrt(camera.widest)
+    half_m = 0.5 * (SIDE - 1) * voxel_m
+    radius_m = np.sqrt(3.0) * half_m
     for block in range(first, last):
         x0, y0, z0 = corners[block, 0] * voxel_m, corners[block, 1] * voxel_m, corners[block, 2] * voxel_m
-        px, py, pz = x0 + half, y0 + half, z0 + half
-        cx = T[0, 0] * px + T[0, 1] * py + T[0, 2] * pz + T[0, 3]
-        cy = T[1, 0] * px + T[1, 1] * py + T[1, 2] * pz + T[1, 3]
-        cz = T[2, 0] * px + T[2, 1] * py + T[2, 2] * pz + T[2, 3]
+        x, y, z = _moved(T, x0 + half_m, y0 + half_m, z0 + half_m)
         # Outside the cone around the image's corners: no voxel of it can be seen.
-        if cz < -radius or np.hypot(cx, cy) > widest * cz + radius * np.sqrt(1.0 + camera.widest):
+        if z < -radius_m or np.hypot(x, y) > widest * z + radius_m * np.sqrt(1.0 + camera.widest):
             continue
         for voxel in range(VOXELS):
-            px = x0 + (voxel // (SIDE * SIDE)) * voxel_m
-            py = y0 + (voxel // SIDE % SIDE) * voxel_m
-            pz = z0 + (voxel % SIDE) * voxel_m
-            x = T[0, 0] * px + T[0, 1] * py + T[0, 2] * pz + T[0, 3]
-            y = T[1, 0] * px + T[1, 1] * py + T[1, 2] * pz + T[1, 3]
-            z = T[2, 0] * px + T[2, 1] * py + T[2, 2] * pz + T[2, 3]
+            i, j, k = voxel // (SIDE * SIDE), voxel // SIDE % SIDE, voxel % SIDE
+            x, y, z = _moved(T, x0 + i * voxel_m, y0 + j * voxel_m, z0 + k * voxel_m)
             if z > 0.0 and x * x + y * y < camera.widest * z * z:
                 _add(block, voxel, x / z, y / z, z, voxel_m, camera, sums)
+
+
+@inlined
+def _moved(T: F64, x: float, y: float, z: float) -> tuple[float, float, float]:
+    return (
+        T[0, 0] * x + T[0, 1] * y + T[0, 2] * z + T[0, 3],
+        T[1, 0] * x + T[1, 1] * y + T[1, 2] * z + T[1, 3],
+        T[2, 0] * x + T[2, 1] * y + T[2, 2] * z + T[2, 3],
+    )
 
 
 @inlined

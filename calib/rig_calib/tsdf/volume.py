@@ -133,13 +133,13 @@ def _blocks_of(image: RangeImage, voxel_m: float) -> Keys:
     if not measured.size:
         return np.empty(0, np.int64)
     reach_m = truncation_m(image.sigma_1m, 1.0 / float(measured.min()), voxel_m)
-    rays = pixel_rays(image.grid.intrinsics)
-    longest = math.sqrt(1.0 + float(np.nanmax((rays**2).sum(axis=-1))))
+    rays = np.insert(pixel_rays(image.grid.intrinsics), 2, 1.0, axis=-1)
+    longest = float(np.nanmax(np.linalg.norm(rays, axis=-1)))
     steps = 1 + max(1, math.ceil(2 * reach_m * longest / (0.5 * SIDE * voxel_m)))
     rows, columns = (-(-size // STRIDE_PX) for size in image.inverse_depth.shape)
     keys = np.empty(rows * columns * steps * 8, np.int64)
-    T = np.ascontiguousarray(image.T_rig_grid[:3])
-    count = list_blocks(image.inverse_depth, rays, T, image.sigma_1m, voxel_m, steps, keys)
+    R, origin = image.T_rig_grid[:3, :3], np.ascontiguousarray(image.T_rig_grid[:3, 3])
+    count = list_blocks(image.inverse_depth, rays @ R.T, origin, image.sigma_1m, voxel_m, steps, keys)
     return np.unique(keys[:count])
 
 
