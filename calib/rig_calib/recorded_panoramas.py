@@ -6,8 +6,9 @@ from pathlib import Path
 from rig_protocol.decoding import decode_frame
 from rig_protocol.errors import ConfigurationError
 from rig_protocol.frames import EncodedFrame, PanoramicFrame
-from rig_protocol.recorded_sets import EncodedSet, with_frames
-from rig_protocol.recording import Recording
+from rig_protocol.recorded_hellos import recorded_hellos
+from rig_protocol.recorded_sets import EncodedSet, synchroniser_of, with_frames, with_sets
+from rig_protocol.recording import HELLOS, Recording
 
 _FRAMES = 5  # where nobody says how many: as many as `rig-server --calibrate` takes
 
@@ -24,7 +25,11 @@ def recorded_panoramas(take: Path, frames: int | None = None) -> Iterator[Panora
     """
     recording = Recording(take)
     cameras, found, wanted = recording.description.camera_ids, 0, frames or _FRAMES
-    for one in with_frames(recording.entries()):
+    entries = recording.entries()
+    if not recording.has_sets:  # an agent's take, or of a rig that nobody took sets from
+        hellos = recorded_hellos(recording.document(HELLOS), recording.description)
+        entries = with_sets(entries, synchroniser_of(hellos))
+    for one in with_frames(entries):
         held = [frame for camera_id in cameras if (frame := _whole(one, camera_id)) is not None]
         if len(held) == len(cameras):
             found += 1

@@ -5,12 +5,14 @@ from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 
 from rig_protocol.frames import EncodedFrame, RgbdFrame
+from rig_protocol.messages import Hello
 from rig_protocol.recording_format import Entry, RecordedSet, time_of
-from rig_protocol.synchroniser import Synchroniser
+from rig_protocol.synchroniser import Policy, Synchroniser
 
 # Frames of a camera that a set may still ask for: those that waited in the synchroniser (8) and in sets that
 # nobody had taken (4), and as many again.
 _REMEMBERED = 24
+_DEADLINE_NS = 100_000_000  # in recorded time nobody waits for long
 
 
 @dataclass(frozen=True, slots=True)
@@ -39,6 +41,19 @@ def with_frames(entries: Iterable[Entry], from_ns: int = 0) -> Iterator[EncodedS
 
 def _stamped(came: Iterable[EncodedFrame], time_ns: int | None) -> EncodedFrame | None:
     return next((frame for frame in came if frame.timestamp_ns == time_ns), None)
+
+
+def synchroniser_of(
+    hellos: Mapping[int, Hello],
+    deadline_ns: int = _DEADLINE_NS,
+    max_spread_ns: int | None = None,
+    policy: Policy = "partial",
+) -> Synchroniser:
+    """One that groups the frames of a take without sets; `hellos`: its agents, by the ids of their cameras."""
+    synchroniser = Synchroniser(hellos, deadline_ns, max_spread_ns, policy=policy)
+    for camera_id, hello in hellos.items():
+        synchroniser.camera_joined(camera_id, hello.fps)
+    return synchroniser
 
 
 def with_sets(entries: Iterable[Entry], synchroniser: Synchroniser) -> Iterator[Entry]:

@@ -17,12 +17,11 @@ from rig_protocol.events import ControlAnswered
 from rig_protocol.frames import EncodedFrame, PanoramicFrame, RgbdFrame
 from rig_protocol.messages import ControlValue, Hello
 from rig_protocol.recorded_hellos import recorded_hellos
-from rig_protocol.recorded_sets import EncodedSet, with_frames, with_sets
+from rig_protocol.recorded_sets import EncodedSet, synchroniser_of, with_frames, with_sets
 from rig_protocol.recording import HELLOS, Recording
 from rig_protocol.recording_format import Entry
 from rig_protocol.rig_folder import RigDescription
 from rig_protocol.roster import Slot
-from rig_protocol.synchroniser import Synchroniser
 from rig_server.config import RigSettings
 from rig_server.metrics import CameraMetrics, RateMeter, RigStatus
 from rig_server.receiver import rig_time_ns
@@ -163,15 +162,9 @@ class ReplayedRig:
         if self._has_sets:
             return entries
         options = self._settings.synchroniser
-        synchroniser = Synchroniser(
-            self.description.camera_ids,
-            deadline_ns=int(options.deadline_ms * 1e6),
-            max_spread_ns=None if options.max_spread_ms is None else int(options.max_spread_ms * 1e6),
-            policy=options.policy,
-        )
-        for camera_id, hello in self.hellos.items():
-            synchroniser.camera_joined(camera_id, hello.fps)
-        return with_sets(entries, synchroniser)
+        spread_ns = None if options.max_spread_ms is None else int(options.max_spread_ms * 1e6)
+        deadline_ns = int(options.deadline_ms * 1e6)
+        return with_sets(entries, synchroniser_of(self.hellos, deadline_ns, spread_ns, options.policy))
 
     def _decoded(self, one: EncodedSet) -> PanoramicFrame | None:
         decode = partial(_decode, demosaic=self._settings.demosaic)
