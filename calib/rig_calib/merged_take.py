@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from rig_calib.stages import Progress
-from rig_calib.take_clock import ClockMap, clock_maps, common_clock
+from rig_calib.take_clock import LATEST_NS, ClockMap, clock_maps, common_clock
 from rig_calib.whole_file import whole_file
 from rig_protocol.errors import ConfigurationError, DataError
 from rig_protocol.frames import EncodedFrame
@@ -22,7 +22,15 @@ from rig_protocol.message_fields import integer
 from rig_protocol.messages import Hello
 from rig_protocol.recorded_hellos import recorded_hellos, told_hellos
 from rig_protocol.recorded_sets import synchroniser_of, with_sets
-from rig_protocol.recording import CALIBRATION, DESCRIPTION, HELLOS, MANIFEST, Recording, RecordingWriter
+from rig_protocol.recording import (
+    CALIBRATION,
+    DESCRIPTION,
+    HELLOS,
+    MANIFEST,
+    Recording,
+    RecordingWriter,
+    part_paths,
+)
 from rig_protocol.recording_format import AGENT, ClockReading, DroppedFrames, Entry, RecordedSet, time_of
 from rig_protocol.rig_folder import CameraEntry, RigDescription
 
@@ -34,7 +42,7 @@ _MAX_COUNT = 2**63 - 1
 
 @dataclass(frozen=True, slots=True)
 class MergedPart:
-    """What one take gave: frames, and how well its clock is known on the common one (standard uncertainty)."""
+    """What one take gave: frames, and the standard uncertainty of its clock against the common one."""
 
     path: Path
     frames: int
@@ -88,18 +96,21 @@ class _Take:
 def merge_takes(
     paths: Sequence[Path], out: Path, max_spread_ms: float | None = None, progress: Progress | None = None
 ) -> Merge:
-    """Write one take that holds all frames of several; `max_spread_ms` limits its sets (None: a frame period).
+    """Write one take that holds all frames of several; `max_spread_ms` limits its sets, else a frame period.
 
-    ConfigurationError where they do not go together or `out` exists, DataError for a damaged file, RigError
-    when `out` cannot be written; nothing of it is left then.
+    Further parts of a take that is given come with it, and may be given, too. ConfigurationError where the
+    takes do not go together or `out` exists, DataError for a damaged file, RigError when `out` cannot be
+    written; nothing of it is left then.
     """
     tell: Progress = progress or (lambda _stage, _share: None)
     if out.exists():
         raise ConfigurationError(f"{out} exists: a take is never overwritten, give another name")
+    further = {part for path in paths for part in part_paths(path)[1:]}
+    firsts = [path for path in dict.fromkeys(paths) if path not in further]
     takes = []
-    for k, path in enumerate(paths):
+    for k, path in enumerate(firsts):
         takes.append(_read(path, k))
-        tell("read", (k + 1) / len(paths))
+        tell("read", (k + 1) / len(firsts))
     clock = common_clock({str(take.path): take.clocks for take in takes})
     placed = [_Placed(take, take.clocks[clock]) for take in takes]
     _check_cameras(placed)
@@ -149,17 +160,22 @@ class _Placed:
         """What goes on, on the common clock, each with a time that never falls."""
         latest_ns = 0
         for entry in self.take.recording.entries():
+            moved = self._moved(entry)
+            if moved is not None:
+                latest_ns = max(latest_ns, time_of(moved))
+                yield latest_ns, moved
+
+    def _moved(self, entry: Entry) -> EncodedFrame | DroppedFrames | None:
+        """The entry on the common clock; None for sets, which are made anew, and for clocks, which did it."""
+        try:
             if isinstance(entry, EncodedFrame):
-                moved: Entry = self.clock.frame(entry)
-            elif isinstance(entry, DroppedFrames):
-                moved = self.clock.dropped(entry)
-            else:  # sets are made anew, of all cameras; clocks have done their work
-                continue
-            latest_ns = max(latest_ns, time_of(moved))
-            yield latest_ns, moved
+                return self.clock.frame(entry)
+            return self.clock.dropped(entry) if isinstance(entry, DroppedFrames) else None
+        except DataError as error:
+            raise DataError(f"{self.take.path}: {error}") from error
 
     def _on_clock(self, time_ns: int) -> int:
-        return max(0, time_ns + self.clock.offset_at(time_ns)[0])
+        return min(max(0, time_ns + self.clock.offset_at(time_ns)[0]), LATEST_NS)
 
 
 def _read(path: Path, number: int) -> _Take:
@@ -241,11 +257,9 @@ def _write(
     spread_ns = None if max_spread_ms is None else int(max_spread_ms * 1e6)
     synchroniser = synchroniser_of(recorded_hellos(documents[HELLOS], description), max_spread_ns=spread_ns)
     start_ns, end_ns = min(one.start_ns for one in placed), max(one.end_ns for one in placed)
-    in_order = (
-        entry for _, entry in heapq.merge(*(one.entries() for one in placed), key=lambda each: each[0])
-    )
+    in_order = heapq.merge(*(one.entries() for one in placed), key=lambda timed: timed[0])
     frames = sets = lost = 0
-    for entry in with_sets(in_order, synchroniser):
+    for entry in with_sets((entry for _, entry in in_order), synchroniser):
         writer.write(entry)
         frames += isinstance(entry, EncodedFrame)
         sets += isinstance(entry, RecordedSet)

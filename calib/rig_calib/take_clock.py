@@ -14,7 +14,8 @@ from rig_protocol.recording_format import ClockReading, DroppedFrames
 # in the estimate that the readings are of (protocol/SPEC.md, section 8).
 _WANDER = 1e-6
 _DRIFT = 100e-6
-_LATEST_NS = 2**62  # year 2116 in UTC: sums of two such times still fit what a recording holds
+LATEST_NS = 2**62
+"""The latest time that is taken for one: the year 2116 in UTC."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -88,8 +89,8 @@ def common_clock(takes: Mapping[str, Mapping[str, ClockMap]]) -> str:
     if not shared:
         told = "; ".join(f"{name} knows {_words(clocks)}" for name, clocks in takes.items())
         raise ConfigurationError(
-            f"no clock is known to all takes ({told}): record while all agents hear one server, or with chrony "
-            "running on every machine"
+            f"no clock is known to all takes ({told}): record while all agents hear one server, or let "
+            "chrony run on every machine (docs/recording.md)"
         )
     return min(shared, key=lambda clock: max(c[clock].typical_uncertainty_ns for c in takes.values()))
 
@@ -105,10 +106,10 @@ def _map(told: Mapping[int, tuple[int, int]]) -> ClockMap:
 
 
 def _with(uncertainty_ns: int, more_ns: float) -> int:
-    return ceil(hypot(uncertainty_ns, more_ns))
+    return min(ceil(hypot(uncertainty_ns, more_ns)), LATEST_NS)
 
 
 def _plausible(time_ns: int) -> int:
-    if not 0 <= time_ns <= _LATEST_NS:
+    if not 0 <= time_ns <= LATEST_NS:
         raise DataError(f"the clock of the take is out of reason: it leads to {time_ns} ns")
     return time_ns

@@ -165,7 +165,7 @@ def _read_hello(body: bytes) -> Hello:
 
 
 def _hello_of(values: Fields, model: CameraModel) -> Hello:
-    hello = Hello(
+    return Hello(
         name=text(values, "name", MAX_NAME_BYTES),
         camera_id=optional(integer, values, "camera_id", 0, 255),
         serial=optional(text, values, "serial", MAX_NAME_BYTES),
@@ -178,9 +178,6 @@ def _hello_of(values: Fields, model: CameraModel) -> Hello:
         ciphers=ciphers(values, "ciphers"),
         controls=flag(values, "controls"),
     )
-    if not hello.color_codecs and not hello.depth_codecs:
-        raise DataError("neither color_codecs nor depth_codecs offers a stream")
-    return hello
 
 
 # ---- WELCOME

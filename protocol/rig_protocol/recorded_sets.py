@@ -49,7 +49,7 @@ def synchroniser_of(
     max_spread_ns: int | None = None,
     policy: Policy = "partial",
 ) -> Synchroniser:
-    """One that groups the frames of a take without sets; `hellos`: its agents, by the ids of their cameras."""
+    """One that groups the frames of a take without sets; `hellos`: its agents, by camera id."""
     synchroniser = Synchroniser(hellos, deadline_ns, max_spread_ns, policy=policy)
     for camera_id, hello in hellos.items():
         synchroniser.camera_joined(camera_id, hello.fps)

@@ -126,7 +126,6 @@ def test_the_longest_hello_is_one_datagram() -> None:
         {"color_codecs": (0,)},
         {"color_codecs": (256,)},
         {"color_codecs": tuple(range(1, 18))},
-        {"color_codecs": (), "depth_codecs": ()},
         {"ciphers": ()},
     ],
 )
