@@ -153,6 +153,17 @@ def test_reading_begins_where_it_is_asked_to(tmp_path: Path) -> None:
     assert list(Recording(path).entries(from_ns)) == taken[60:]
 
 
+def test_a_take_never_ends_before_it_begins(tmp_path: Path) -> None:
+    """Players divide by its length. Found by fuzzing: a chunk's header said the opposite."""
+    path, taken = tmp_path / "take.mcap", entries(3)
+    write(path, taken)
+    data, place = bytearray(path.read_bytes()), scan(path).chunks[0]
+    data[place.offset : place.offset + 16] = struct.pack("<QQ", place.end_ns, place.start_ns)
+    path.write_bytes(data)
+    assert Recording(path).start_ns <= Recording(path).end_ns
+    assert list(Recording(path).entries()) == taken
+
+
 @pytest.mark.parametrize("content", [b"", b"PNG", MAGIC[:5]])
 def test_another_file_is_refused_in_words(tmp_path: Path, content: bytes) -> None:
     path = tmp_path / "take.mcap"
