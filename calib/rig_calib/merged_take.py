@@ -31,12 +31,14 @@ from rig_protocol.recording import (
     RecordingWriter,
     part_paths,
 )
-from rig_protocol.recording_format import AGENT, ClockReading, DroppedFrames, Entry, RecordedSet, time_of
+from rig_protocol.recording_format import AGENT, UTC, ClockReading, DroppedFrames, Entry, RecordedSet, time_of
 from rig_protocol.rig_folder import CameraEntry, RigDescription
 
 MERGE = "merge.json"
 """Name of the attachment that tells what was merged."""
 _TELL_EVERY = 200  # frames
+_SECOND_NS = 1_000_000_000
+_LAST_SECOND = 1 << 33  # year 2242
 _MAX_COUNT = 2**63 - 1
 
 
@@ -116,7 +118,7 @@ def merge_takes(
     _check_cameras(placed)
     documents = _documents(takes, clock, [one.part for one in placed])
     with whole_file(out) as output:
-        writer = RecordingWriter(output, _now(), placed[0].start_ns, clock.partition("/")[0])
+        writer = RecordingWriter(output, *_begun(placed, clock), clock.partition("/")[0])
         for name, values in documents.items():
             writer.attach(name, values, placed[0].start_ns)
         frames, sets, lost = _write(writer, placed, documents, max_spread_ms, tell)
@@ -285,5 +287,16 @@ def _received(takes: Sequence[_Take]) -> dict[str, dict[str, int]]:
     return {camera_id: dict(counts) for camera_id, counts in sorted(total.items())}
 
 
-def _now() -> str:
-    return datetime.now(UTC_ZONE).isoformat(timespec="seconds")
+def _begun(placed: Sequence[_Placed], clock: str) -> tuple[str, int]:
+    """Date and time, and the same moment on the common clock; none where no take tells its date."""
+    for one in placed:
+        recording, utc_minus_ns = one.take.recording, one.take.recording.utc_minus_rig_time_ns
+        if clock == UTC:
+            second, rest_ns = divmod(one.start_ns, _SECOND_NS)
+        elif utc_minus_ns is not None:
+            second, rest_ns = divmod(recording.start_ns + utc_minus_ns, _SECOND_NS)
+        else:
+            continue
+        if 0 <= second < _LAST_SECOND and one.start_ns > rest_ns:
+            return datetime.fromtimestamp(second, UTC_ZONE).isoformat(), one.start_ns - rest_ns
+    return "", 0

@@ -18,6 +18,15 @@ def is_recording(capture: Path) -> bool:
     return capture.suffix == ".mcap" and not capture.is_dir()
 
 
+def encoded_sets(recording: Recording) -> Iterator[EncodedSet]:
+    """The sets that went out; those that the synchroniser makes now where a take has none (an agent's)."""
+    entries = recording.entries()
+    if not recording.has_sets:
+        hellos = recorded_hellos(recording.document(HELLOS), recording.description)
+        entries = with_sets(entries, synchroniser_of(hellos))
+    return with_frames(entries)
+
+
 def recorded_panoramas(take: Path, frames: int | None = None) -> Iterator[PanoramicFrame]:
     """The first `frames` sets (default: 5) that hold an undamaged frame of every camera, read one by one.
 
@@ -25,11 +34,7 @@ def recorded_panoramas(take: Path, frames: int | None = None) -> Iterator[Panora
     """
     recording = Recording(take)
     cameras, found, wanted = recording.description.camera_ids, 0, frames or _FRAMES
-    entries = recording.entries()
-    if not recording.has_sets:  # an agent's take, or of a rig that nobody took sets from
-        hellos = recorded_hellos(recording.document(HELLOS), recording.description)
-        entries = with_sets(entries, synchroniser_of(hellos))
-    for one in with_frames(entries):
+    for one in encoded_sets(recording):
         held = [frame for camera_id in cameras if (frame := _whole(one, camera_id)) is not None]
         if len(held) == len(cameras):
             found += 1

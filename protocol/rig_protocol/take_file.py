@@ -83,6 +83,7 @@ class TakeFile:
         self._now_ns, self._clock = now_ns, clock
         self._number, self._before = 0, 0
         self._documents: Mapping[str, Any] = {}
+        self._attached: dict[str, Any] = {}
         self._open()
 
     @property
@@ -121,11 +122,14 @@ class TakeFile:
         self._disk = DiskFile(part_path(self._path, self._number))
         created = datetime.now(UTC).isoformat(timespec="seconds")
         self._writer = RecordingWriter(self._disk, created, self._now_ns(), self._clock)
+        self._attached.clear()
         self._attach()
 
     def _attach(self) -> None:
         for name, values in self._documents.items():
-            self._writer.attach(name, values, self._now_ns())
+            if self._attached.get(name) is not values:  # writing a calibration as JSON takes some ms
+                self._writer.attach(name, values, self._now_ns())
+                self._attached[name] = values
 
     def _finish_part(self, cameras: Mapping[str, Mapping[str, int]]) -> None:
         self._writer.finish(cameras, self._now_ns())

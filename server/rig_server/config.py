@@ -19,6 +19,7 @@ from rig_protocol.synchroniser import Policy
 ENVIRONMENT_PREFIX = "RIG_SERVER_"
 CONFIG_PLACES = (Path("rig.toml"), Path("/etc/kinect-rig/rig.toml"))
 DEFAULT_PORT = 4012
+MAX_SETS = 100  # of one calibration: more average nothing away, and fill the memory
 MAX_CAMERAS = 64  # what one server holds in memory and one roster names; a ring has twelve
 CAMERA_NAME = r"^[A-Za-z0-9][A-Za-z0-9_.-]{0,31}$"  # it names folders and files
 
@@ -103,7 +104,7 @@ class LinkSettings(Settings):
 class CaptureSettings(Settings):
     """What `--calibrate` waits for and collects."""
 
-    frames: int = Field(5, ge=1, le=100)
+    frames: int = Field(5, ge=1, le=MAX_SETS)
     """Panoramic frames to calibrate on."""
     target_deg: float | None = Field(None, gt=0, le=180, examples=[0.1])
     """End as soon as every pair of neighbours is expected to be known this well (root mean square)."""
@@ -126,6 +127,9 @@ class WatchSettings(Settings):
 
 class RecordingSettings(TakeSettings):
     """How `--record FILE.mcap` records (docs/recording.md)."""
+
+    folder: Path = Path()
+    """Where takes go that are begun while the server runs; relative to where it was started."""
 
 
 class RigSettings(Settings):

@@ -10,6 +10,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+from rig_calib.rig_calibration import RigCalibration
 from rig_protocol.codecs import COLOR_CODECS, DEPTH_CODECS
 from rig_protocol.errors import RigError
 from rig_protocol.events import (
@@ -66,6 +67,7 @@ class LivePipeline:
 
     def __init__(self, settings: RigSettings, key: RigKey, record: Path | None = None) -> None:
         """`record`: the file to record to."""
+        self.calibration: RigCalibration | None = None
         self._settings = settings
         self._durations = Durations()
         self._assembler = Assembler(_synchroniser(settings), self._durations.set_delivered)
@@ -141,10 +143,14 @@ class LivePipeline:
             self.start_recording(self._take)
         self._receiver.start()
 
-    def stop(self) -> None:
-        """Say goodbye to the cameras and end all threads; harmless when already stopped."""
+    def end_sets(self) -> None:
+        """Say goodbye to the cameras and end all threads but that of a recording, which stays open."""
         self._receiver.stop()
         self._decoder.close()
+
+    def stop(self) -> None:
+        """End all of it; harmless when already stopped."""
+        self.end_sets()
         self.stop_recording()
 
     def start_recording(self, take: Path) -> None:
@@ -263,7 +269,7 @@ class LivePipeline:
 
     def _documents(self) -> Mapping[str, Any]:
         """What a recording tells of the rig, as it is now."""
-        return take_documents(self._settings, self.description, self.hellos)
+        return take_documents(self._settings, self.description, self.hellos, self.calibration)
 
     def _clock_reading(self) -> ClockReading | None:
         """The rig clock against the world's, where something disciplines this machine's."""

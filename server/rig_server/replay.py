@@ -10,6 +10,8 @@ from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
+from rig_calib.recorded_calibration import recorded_calibration
+from rig_calib.rig_calibration import RigCalibration
 from rig_protocol.codecs import keep_freed_memory
 from rig_protocol.decoding import decode_frame
 from rig_protocol.errors import ConfigurationError, DataError, RigError
@@ -53,6 +55,7 @@ class ReplayedRig:
         self._recording, self._settings, self._options = Recording(take), settings, options
         self.description: RigDescription = self._recording.description
         self.hellos: dict[int, Hello] = recorded_hellos(self._recording.document(HELLOS), self.description)
+        self.calibration = _calibration_of(self._recording)
         self._has_sets = self._recording.has_sets
         span_s = (self._recording.end_ns - self._recording.start_ns) / 1e9
         if options.seek_s > span_s:
@@ -78,6 +81,10 @@ class ReplayedRig:
 
     def start(self) -> None:
         """A file is always there."""
+
+    def end_sets(self) -> None:
+        """End the decoders; harmless when already ended."""
+        self.stop()
 
     def stop(self) -> None:
         """End the decoders; harmless when already ended."""
@@ -179,6 +186,15 @@ class ReplayedRig:
             self._frames.update(frame.camera_id for frame in present)
             self._damaged.update(frame.camera_id for frame in present if frame.damaged)
         return panorama
+
+
+def _calibration_of(recording: Recording) -> RigCalibration | None:
+    """The one that the take brings; one that cannot be read is no reason not to play its images."""
+    try:
+        return recorded_calibration(recording)
+    except DataError as error:
+        logger.warning("%s; the take plays without it", error)
+        return None
 
 
 def _decode(frame: EncodedFrame | None, demosaic: bool) -> RgbdFrame | None:

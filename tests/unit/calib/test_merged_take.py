@@ -65,11 +65,12 @@ def write(
     clock: str | None = AGENT,
     serial: str | None = None,
     finish: bool = True,
+    begun: tuple[str, int] = ("", 0),
 ) -> Path:
     name = f"cam{camera_id:02d}"
     hello = Hello(name, camera_id, serial, None, CameraModel(), (COLOR.id,), (DEPTH.id,), 30.0, "test")
     with path.open("wb") as output:
-        writer = RecordingWriter(output, "", 0, clock)
+        writer = RecordingWriter(output, *begun, clock)
         cameras = (CameraEntry(camera_id, name, CameraModel()),)
         writer.attach(DESCRIPTION, RigDescription(cameras).to_dict(), 0)
         writer.attach(HELLOS, told_hellos({camera_id: hello}), 0)
@@ -127,6 +128,18 @@ def test_everything_else_plays_what_was_merged(takes: list[Path], tmp_path: Path
             assert theirs is not None
             assert np.array_equal(mine.raw, np.full((4, 6), 50 * i + k))
             assert np.array_equal(mine.bayer, theirs.bayer)
+
+
+def test_a_merged_take_tells_the_date_of_its_frames(takes: list[Path], tmp_path: Path) -> None:
+    utc_ns = 1_700_000_000 * SECOND_NS
+    begun_ns = frame(1, 0).timestamp_ns
+    dated = write(tmp_path / "dated.mcap", 1, taken(1), begun=("2023-11-14T22:13:20+00:00", begun_ns))
+    merge_takes([takes[0], dated], tmp_path / "rig.mcap")
+    known = Recording(tmp_path / "rig.mcap").utc_minus_rig_time_ns
+    assert known is not None
+    assert abs(known - (utc_ns - begun_ns - OFFSETS_NS[1])) < SECOND_NS
+    merge_takes(takes[:2], tmp_path / "dateless.mcap")
+    assert Recording(tmp_path / "dateless.mcap").utc_minus_rig_time_ns is None
 
 
 def test_one_agents_take_is_a_rig_of_one_camera(takes: list[Path]) -> None:
