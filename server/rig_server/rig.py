@@ -17,12 +17,13 @@ from rig_protocol.frames import PanoramicFrame
 from rig_protocol.key_file import rig_key
 from rig_protocol.messages import ControlValue, Hello
 from rig_protocol.poses import Pose
+from rig_protocol.recorder import RecordingStatus
 from rig_protocol.rig_folder import RigDescription
 from rig_protocol.rig_key import RigKey
 from rig_protocol.roster import Slot
 from rig_protocol.troubleshooting import Topic
 from rig_server.config import MAX_CAMERAS, RigSettings, load_rig_settings, parse_address
-from rig_server.metrics import RecordingStatus, RigStatus
+from rig_server.metrics import RigStatus
 from rig_server.pipeline import LivePipeline
 from rig_server.recorded import RecordedRig
 from rig_server.replay import ReplayedRig, ReplayOptions
