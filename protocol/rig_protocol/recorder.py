@@ -65,13 +65,15 @@ class TakeContext:
     """What a recorder asks for beside the frames, on its own thread.
 
     `documents`: what is to be attached, by name, as it is now; `cameras`: counts for the manifest; `reading`:
-    the take's clock against others, now; `clock`: its name (docs/recording.md), None where it has none.
+    the take's clock against others, now; `clock`: its name (docs/recording.md), None where it has none;
+    `moment`: UTC in words (ISO 8601) and that clock, at one moment; default: now, by this machine.
     """
 
     documents: Callable[[], Mapping[str, Any]] = dict
     cameras: Callable[[], Mapping[str, Mapping[str, int]]] = dict
     reading: Callable[[], ClockReading | None] = lambda: None
     clock: str | None = None
+    moment: Callable[[], tuple[str, int]] | None = None
 
 
 class Changed(AbstractContextManager[bool], Protocol):
@@ -105,7 +107,7 @@ class Recorder:
         """Open the file; ConfigurationError when it exists or cannot be written. `now_ns`: its clock."""
         self._path, self._settings, self._context = path, settings, context
         self._now_ns = now_ns
-        self._file = TakeFile(path, settings.part_gib * 2**30, now_ns, context.clock)
+        self._file = TakeFile(path, settings.part_gib * 2**30, now_ns, context.clock, context.moment)
         self._changed = changed  # guards what follows
         self._waiting: deque[Entry] = deque()
         self._waiting_bytes = 0
@@ -137,6 +139,13 @@ class Recorder:
                 self._changed.notify()
             elif frame is not None:
                 self._drop(frame.camera_id, frame.timestamp_ns)
+
+    def wait_for_room(self, timeout_s: float) -> bool:
+        """Wait until half the queue is free, for who need not drop frames; False when it is not in time."""
+        with self._changed:
+            if self._waiting_bytes > self._settings.queue_mib * _MIB // 2:
+                self._changed.wait(timeout_s)
+            return self._waiting_bytes <= self._settings.queue_mib * _MIB // 2
 
     def add_dropped(self, camera_id: int, timestamp_ns: int) -> None:
         """Note a frame that was lost on the way here."""
@@ -218,6 +227,7 @@ class Recorder:
             if isinstance(entry, EncodedFrame):
                 self._waiting_bytes -= _bytes_of(entry)
                 self._frames += 1
+                self._changed.notify()  # who waits for room: the only one that waits while there is work
         return False
 
     def _tell_dropped(self) -> None:

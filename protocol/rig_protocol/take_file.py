@@ -73,14 +73,20 @@ class DiskFile:
 class TakeFile:
     """A take in parts of about `part_bytes`; one thread at a time. OSError when the disk fails.
 
-    `now_ns` reads the clock of its times, `clock` is that clock's name.
+    `now_ns` reads the clock of its times, `clock` is that clock's name. `moment` tells UTC together with a
+    clock that is not this machine's.
     """
 
     def __init__(
-        self, path: Path, part_bytes: float, now_ns: Callable[[], int], clock: str | None = None
+        self,
+        path: Path,
+        part_bytes: float,
+        now_ns: Callable[[], int],
+        clock: str | None = None,
+        moment: Callable[[], tuple[str, int]] | None = None,
     ) -> None:
         self._path, self._part_bytes = path, part_bytes
-        self._now_ns, self._clock = now_ns, clock
+        self._now_ns, self._clock, self._moment = now_ns, clock, moment or self._now
         self._number, self._before = 0, 0
         self._documents: Mapping[str, Any] = {}
         self._attached: dict[str, Any] = {}
@@ -120,10 +126,13 @@ class TakeFile:
 
     def _open(self) -> None:
         self._disk = DiskFile(part_path(self._path, self._number))
-        created = datetime.now(UTC).isoformat(timespec="seconds")
-        self._writer = RecordingWriter(self._disk, created, self._now_ns(), self._clock)
+        created, now_ns = self._moment()
+        self._writer = RecordingWriter(self._disk, created, now_ns, self._clock)
         self._attached.clear()
         self._attach()
+
+    def _now(self) -> tuple[str, int]:
+        return datetime.now(UTC).isoformat(timespec="seconds"), self._now_ns()
 
     def _attach(self) -> None:
         for name, values in self._documents.items():

@@ -152,12 +152,19 @@ class Rig:
         return cls(LivePipeline(settings, rig_key(settings.key_file, settings.insecure), record), settings)
 
     @classmethod
-    def replayed(cls, take: Path, settings: RigSettings, options: ReplayOptions | None = None) -> Self:
+    def replayed(
+        cls,
+        take: Path,
+        settings: RigSettings,
+        options: ReplayOptions | None = None,
+        record: Path | None = None,
+    ) -> Self:
         """A recorded take; the default options play it once, at the speed at which it was recorded.
 
+        `record`: a new file to record to what is played.
         ConfigurationError when there is no such file, DataError when it is no recording.
         """
-        return cls(ReplayedRig(take, settings, options or ReplayOptions()), settings)
+        return cls(ReplayedRig(take, settings, options or ReplayOptions(), record), settings)
 
     @classmethod
     def simulated(

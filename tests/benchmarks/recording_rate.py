@@ -51,7 +51,7 @@ def measure(seconds: float, folder: Path) -> dict[str, float]:
     most_waiting = 0
     for k in range(count):
         for camera_id in range(CAMERAS):
-            sink.add_frame(frame(camera_id, k, noise))
+            sink.add(frame(camera_id, k, noise))
         most_waiting = max(most_waiting, sink.status().waiting_bytes)
         time.sleep(max(0.0, begun_s + (k + 1) / FPS - time.monotonic()))
     elapsed_s = time.monotonic() - begun_s

@@ -3,9 +3,9 @@
 import threading
 from pathlib import Path
 
-from rig_protocol.frames import EncodedFrame, PanoramicFrame
+from rig_protocol.frames import PanoramicFrame
 from rig_protocol.recorder import Recorder, RecordingStatus, TakeContext
-from rig_protocol.recording_format import RecordedSet
+from rig_protocol.recording_format import Entry, RecordedSet
 from rig_server.config import RecordingSettings
 from rig_server.receiver import rig_time_ns
 
@@ -27,13 +27,17 @@ class RecordSink:
         self._recorder.stop()
         self._thread.join()
 
-    def add_frame(self, frame: EncodedFrame) -> None:
-        """Take a frame as it came."""
-        self._recorder.add(frame)
+    def add(self, entry: Entry) -> None:
+        """Take a frame as it came, or what else belongs into the file."""
+        self._recorder.add(entry)
 
-    def add_set(self, panorama: PanoramicFrame) -> None:
+    def add_set(self, panorama: PanoramicFrame, taken_ns: int) -> None:
         """Take a set as it goes out."""
-        self._recorder.add(RecordedSet.of(panorama, rig_time_ns()))
+        self._recorder.add(RecordedSet.of(panorama, taken_ns))
+
+    def wait_for_room(self, timeout_s: float) -> bool:
+        """Wait until most of the queue is free, for who can; False when it is not in time."""
+        return self._recorder.wait_for_room(timeout_s)
 
     def status(self) -> RecordingStatus:
         """How the recording is, at this moment; any thread may ask."""

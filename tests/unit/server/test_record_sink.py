@@ -41,7 +41,7 @@ sink = RecordSink(Path(sys.argv[1]), RecordingSettings(), TakeContext())
 sink.start()
 for k in range(10_000):
     now = time.monotonic_ns()
-    sink.add_frame(EncodedFrame(0, k, now, color=Payload(1, bytes(1000)), received_ns=now))
+    sink.add(EncodedFrame(0, k, now, color=Payload(1, bytes(1000)), received_ns=now))
     if k == 150:
         print("now", flush=True)
     time.sleep(0.01)
@@ -84,7 +84,7 @@ def test_a_slow_disk_costs_whole_frames_which_the_status_and_the_file_count(
     sink = sink_to(tmp_path / "take.mcap", queue_mib=8)
     sink.start()
     for k in range(12):  # returns at once for each, though the disk takes none
-        sink.add_frame(frame(k, size=1 << 20))
+        sink.add(frame(k, size=1 << 20))
     assert blocked.reached.wait(30)
     assert sink.status().dropped == 4
     blocked.release.set()
@@ -124,10 +124,10 @@ def test_a_full_disk_ends_the_recording_with_a_sound_file_and_hurts_nobody(tmp_p
     disk = sink._recorder._file._disk
     disk._file = SmallDisk(disk._file, sink, 10 << 20)  # type: ignore[assignment]
     for k in range(20):
-        sink.add_frame(frame(k, size=1 << 20))
+        sink.add(frame(k, size=1 << 20))
     sink._thread.join(30)
     assert sink.status().ended == "the disk is full"
-    sink.add_frame(frame(99))  # forgotten, without an error
+    sink.add(frame(99))  # forgotten, without an error
     sink.stop()
     with path.open("rb") as file:  # as any program reads it
         messages = list(make_reader(file, validate_crcs=True).iter_messages())
@@ -139,7 +139,7 @@ def test_a_disk_with_too_little_room_ends_the_recording_in_order(tmp_path: Path)
     path = tmp_path / "take.mcap"
     sink = sink_to(path, keep_free_mib=1 << 30)
     sink.start()
-    sink.add_frame(frame(0))
+    sink.add(frame(0))
     sink._thread.join(30)
     ended = sink.status().ended
     sink.stop()
@@ -153,7 +153,7 @@ def test_a_take_is_split_by_size_and_read_as_one(tmp_path: Path) -> None:
     sink = sink_to(path, part_gib=0.01)
     sink.start()
     for k in range(40):
-        sink.add_frame(frame(k, size=1 << 20))
+        sink.add(frame(k, size=1 << 20))
     sink.stop()
     assert [part.name for part in part_paths(path)][:2] == ["take.mcap", "take.001.mcap"]
     recording = Recording(path)
@@ -238,8 +238,6 @@ def test_a_running_rig_starts_and_ends_recordings_one_after_another(tmp_path: Pa
                 assert rig.next_panorama(5.0) is not None  # and is not recorded
                 with Rig.replayed(tmp_path / name, SETTINGS, ReplayOptions(speed=None)) as replayed:
                     assert same_set(list(replayed)[-1], given[-1])
-    with pytest.raises(RigError, match="no live rig"):
-        Rig.open(tmp_path / "a.mcap", SETTINGS).start_recording(tmp_path / "c.mcap")
 
 
 def test_the_operator_reads_how_the_recording_is_and_why_it_ended() -> None:
