@@ -4,13 +4,14 @@ Entities: rig/NAME (pose of the colour camera), rig/NAME/color, rig/NAME/depth (
 rig/NAME/depth/image, rig/cloud, panorama. Rerun's pinhole knows no distortion.
 """
 
-from collections.abc import Sequence
-from contextlib import closing
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
 import rerun as rr
 
+from rig_calib.frame_exports.frame_files import make_folder_of
 from rig_calib.frame_exports.job import Exported, ExportJob
 from rig_calib.frame_exports.placed_cameras import (
     PlacedCamera,
@@ -23,21 +24,25 @@ from rig_calib.frame_exports.time_stamps import TimeStamps
 from rig_calib.whole_file import whole_path
 from rig_calib.whole_folder import refuse_existing
 from rig_protocol.camera import Intrinsics
+from rig_protocol.errors import RigError
 from rig_protocol.frames import DepthFrame
 from rig_protocol.poses import Pose
+from rig_protocol.troubleshooting import Topic
 
 FRAME, RIG_TIME, UTC = "frame", "rig_time", "utc"
 _APPLICATION = "kinect-rig"
 _RIG = "rig"
+_FLUSH_S = 20.0  # for ever, by default, where the writing thread has ended
 _RING_AXES = rr.ViewCoordinates.FLU  # x through camera 0, z up
 
 
 def export(job: ExportJob) -> Exported:
     """Write the file; what is left out is in the notes."""
     refuse_existing(job.out)
+    make_folder_of(job.out)
     cameras, stamps = placed_cameras(job), TimeStamps.of(job.capture)
     written = dict.fromkeys((camera.id for camera in cameras), 0)
-    with whole_path(job.out) as path, closing(_Log(path, stamps)) as log:
+    with whole_path(job.out) as path, _opened(path, stamps) as log:
         if job.needed_calibration().rig_frame == "ring":
             log.recording.log(_RIG, _RING_AXES, static=True)
         for camera in cameras:
@@ -52,12 +57,25 @@ def export(job: ExportJob) -> Exported:
     return Exported((job.out,), (*unplaced_notes(job, cameras), *missing, *stamps.notes))
 
 
+@contextmanager
+def _opened(path: Path, stamps: TimeStamps) -> Iterator["_Log"]:
+    """A log to this file; RigError where it cannot be written, which Rerun tells as a RuntimeError."""
+    recording = rr.RecordingStream(_APPLICATION)
+    try:
+        recording.save(path)
+        yield _Log(recording, stamps)
+        recording.flush(timeout_sec=_FLUSH_S)
+        recording.disconnect()
+    except RuntimeError as error:
+        rr.unregister_shutdown()  # it, too, would wait for ever for what cannot be written
+        raise RigError(f"{path} could not be written: {error}", Topic.FULL_DISK) from error
+
+
 class _Log:
     """What is logged, on its way to the file: never more than a panoramic frame is held."""
 
-    def __init__(self, path: Path, stamps: TimeStamps) -> None:
-        self.recording = rr.RecordingStream(_APPLICATION)
-        self.recording.save(path)
+    def __init__(self, recording: rr.RecordingStream, stamps: TimeStamps) -> None:
+        self.recording = recording
         rr.set_log_time_enabled(False, self.recording)
         rr.set_log_tick_enabled(False, self.recording)
         self._stamps = stamps
@@ -88,12 +106,7 @@ class _Log:
         self.recording.log([_RIG, "cloud"], rr.Points3D(frame.points_m, colors=frame.colors))
         panorama = rr.EncodedImage(contents=frame.panorama_jpeg, media_type="image/jpeg")
         self.recording.log("panorama", panorama)
-        self.recording.flush()
-
-    def close(self) -> None:
-        """End the file."""
-        self.recording.flush()
-        self.recording.disconnect()
+        self.recording.flush(timeout_sec=_FLUSH_S)
 
     def _camera(self, camera: PlacedCamera, shown: ShownCamera) -> None:
         color = rr.EncodedImage(contents=shown.color_jpeg, media_type="image/jpeg")
