@@ -4,6 +4,7 @@ Entities: rig/NAME (pose of the colour camera), rig/NAME/color, rig/NAME/depth (
 rig/NAME/depth/image, rig/cloud, panorama. Rerun's pinhole knows no distortion.
 """
 
+import shutil
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -32,6 +33,7 @@ from rig_protocol.troubleshooting import Topic
 FRAME, RIG_TIME, UTC = "frame", "rig_time", "utc"
 _APPLICATION = "kinect-rig"
 _RIG = "rig"
+_SPARE_BYTES = 100 << 20  # two panoramic frames of twelve cameras, and what others write meanwhile
 _FLUSH_S = 20.0  # for ever, by default, where the writing thread has ended
 _RING_AXES = rr.ViewCoordinates.FLU  # x through camera 0, z up
 
@@ -63,19 +65,27 @@ def _opened(path: Path, stamps: TimeStamps) -> Iterator["_Log"]:
     recording = rr.RecordingStream(_APPLICATION)
     try:
         recording.save(path)
-        yield _Log(recording, stamps)
+        yield _Log(recording, path, stamps)
         recording.flush(timeout_sec=_FLUSH_S)
-        recording.disconnect()
-    except RuntimeError as error:
-        rr.unregister_shutdown()  # it, too, would wait for ever for what cannot be written
+    except RuntimeError as error:  # no disconnect: it waits for ever for a file that cannot be written
         raise RigError(f"{path} could not be written: {error}", Topic.FULL_DISK) from error
+    except BaseException:
+        recording.disconnect()
+        raise
+    recording.disconnect()
+
+
+def _refuse_full_disk(path: Path) -> None:
+    """Before Rerun meets it: its SDK (0.41) never returns from a disk that filled up under it."""
+    if shutil.disk_usage(path.parent).free < _SPARE_BYTES:
+        raise RigError(f"{path} could not be written: the disk is nearly full", Topic.FULL_DISK)
 
 
 class _Log:
     """What is logged, on its way to the file: never more than a panoramic frame is held."""
 
-    def __init__(self, recording: rr.RecordingStream, stamps: TimeStamps) -> None:
-        self.recording = recording
+    def __init__(self, recording: rr.RecordingStream, path: Path, stamps: TimeStamps) -> None:
+        self.recording, self._path = recording, path
         rr.set_log_time_enabled(False, self.recording)
         rr.set_log_tick_enabled(False, self.recording)
         self._stamps = stamps
@@ -96,7 +106,8 @@ class _Log:
         self.recording.log(place, pinhole, static=True)
 
     def frame(self, frame: ShownFrame, cameras: Sequence[PlacedCamera]) -> None:
-        """One panoramic frame: its images at their exposures, the rest at its mean."""
+        """One panoramic frame: images at their exposures, the rest at its mean; RigError on a full disk."""
+        _refuse_full_disk(self._path)
         by_id = {camera.id: camera for camera in cameras}
         self.recording.set_time(FRAME, sequence=frame.index)
         for shown in frame.cameras:
