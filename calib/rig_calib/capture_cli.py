@@ -35,6 +35,8 @@ _EXPORT_EXAMPLES = """
 `rig-calib export results/calibration.json --format ros2 --out rig.launch.py` — the calibration, for a program
 
 `rig-calib export take.mcap --format foxglove --out view.mcap` — images, cloud and transforms, for Foxglove
+
+`rig-calib export take.mcap --format rig-folder --out rig --frames 5` — a rig folder, for `rig-calib solve`
 """
 
 
@@ -70,7 +72,8 @@ def export(
         typer.Option(
             "--format",
             metavar="FORMAT",
-            help="kalibr, ros2, urdf, colmap, nerfstudio, opencv; of frames others. See docs/exports.md.",
+            help="kalibr, ros2, urdf, colmap, nerfstudio, opencv; of frames foxglove, rerun, tum, rig-folder "
+            "and others. See docs/exports.md.",
         ),
     ],
     out: Annotated[Path, typer.Option(help="File to write, or a folder, as the format has it.")],
@@ -98,7 +101,9 @@ def export(
     """Write a calibration, or the frames of a capture, for another program (docs/exports.md)."""
     from rich.console import Console
 
+    from rig_calib.exports.formats import FORMATS as CALIBRATION_FORMATS
     from rig_calib.frame_exports.formats import FORMATS
+    from rig_protocol.errors import ConfigurationError
 
     console = Console(highlight=False, soft_wrap=True)
     if form in FORMATS:
@@ -113,8 +118,11 @@ def export(
             workers,
             scheduler,
         )
-    else:
+    elif form in CALIBRATION_FORMATS:
         _export_calibration(console, form, source, out, rig, frames or 1)
+    else:
+        known = ", ".join((*CALIBRATION_FORMATS, *FORMATS))
+        raise ConfigurationError(f"format {form!r} is none of {known}")
 
 
 def _export_calibration(
