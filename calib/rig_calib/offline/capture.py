@@ -1,26 +1,36 @@
 """A capture on disk, rig folder or recording, whose panoramic frames can be read from any place on."""
 
-from collections.abc import Iterator, Sequence
+import logging
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 from rig_calib.recorded_panoramas import is_recording
 from rig_calib.rig_calibration import RigCalibration
-from rig_calib.rig_folder_calibration import read_description
 from rig_protocol.decoding import decode_frame
-from rig_protocol.errors import ConfigurationError
+from rig_protocol.errors import ConfigurationError, DataError
 from rig_protocol.frames import EncodedFrame, PanoramicFrame, RgbdFrame
-from rig_protocol.recorded_sets import EncodedSet, with_frames
+from rig_protocol.recorded_sets import with_frames
 from rig_protocol.recording import CALIBRATION, Recording
-from rig_protocol.rig_folder import RigDescription, frame_indices, read_frame
+from rig_protocol.recording_format import RecordedSet
+from rig_protocol.rig_folder import RigDescription, frame_indices, read_frame, read_rig_description
+
+logger = logging.getLogger(__name__)
+
+# A frame came after its exposure, as far as the clocks agree.
+_CLOCKS_APART_NS = 100_000_000
 
 
 @dataclass(frozen=True, slots=True)
 class FrameMark:
-    """A panoramic frame's index, and when its set went out in rig time; 0 in a rig folder."""
+    """A panoramic frame's index, and when its set went out in rig time; 0 in a rig folder.
+
+    `from_ns`: rig time from which on its images stand in the recording.
+    """
 
     index: int
     time_ns: int
+    from_ns: int = 0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -35,54 +45,97 @@ class Capture:
     description: RigDescription
     marks: tuple[FrameMark, ...]
     calibration: RigCalibration | None = None
+    recording: Recording | None = None
 
     def read(self, positions: range) -> Iterator[PanoramicFrame]:
-        """The panoramic frames there, complete or not, one by one; DataError where the file is damaged."""
+        """The panoramic frames there, complete or not, one by one; one without any image is left out.
+
+        Of a recording only the chunks are read in which these frames may be. A frame of a recording that
+        does not decode is missing from its set. DataError where the file is damaged.
+        """
         marks = [self.marks[position] for position in positions]
-        if is_recording(self.path):
-            yield from _recorded(self.path, marks)
+        if not marks:
             return
-        for mark in marks:
-            yield _of_folder(self.path, self.description, mark.index)
+        if is_recording(self.path):
+            yield from _recorded(self.recording or Recording(self.path), marks)
+        else:
+            yield from _of_folder(self.path, self.description, marks)
 
 
 def open_capture(path: Path) -> Capture:
     """Look through a capture; ConfigurationError when there is none, or no panoramic frame in it."""
-    description = read_description(path)
-    calibration = None
-    if is_recording(path):
-        recording = Recording(path)
-        marks = tuple(FrameMark(one.index, one.time_ns) for one in with_frames(recording.entries()))
-        if CALIBRATION in recording.attachments:
-            calibration = RigCalibration.from_dict(recording.document(CALIBRATION))
-    else:
-        held = (frame_indices(path, camera.name) for camera in description.cameras)
-        marks = tuple(FrameMark(index, 0) for index in sorted({i for own in held for i in own}))
+    path = path.absolute()  # other processes may stand elsewhere
+    return _open_recording(path) if is_recording(path) else _open_folder(path)
+
+
+def _open_recording(path: Path) -> Capture:
+    recording = Recording(path)
+    marks = tuple(mark for one in recording.sets() if (mark := _mark(one)) is not None)
     if not marks:
+        raise ConfigurationError(
+            f"{path} holds no sets: nobody took panoramic frames while it was recorded. What `rig-server "
+            "--record` writes has them; `rig-server --replay` groups the frames of this one as it plays"
+        )
+    return Capture(path, recording.description, marks, _carried(recording), recording)
+
+
+def _open_folder(path: Path) -> Capture:
+    description = read_rig_description(path)
+    indices = {index for camera in description.cameras for index in frame_indices(path, camera.name)}
+    if not indices:
         raise ConfigurationError(f"{path} holds no panoramic frames")
-    return Capture(path, description, marks, calibration)
+    return Capture(path, description, tuple(FrameMark(index, 0) for index in sorted(indices)))
 
 
-def _recorded(take: Path, marks: Sequence[FrameMark]) -> Iterator[PanoramicFrame]:
-    wanted = {mark.index for mark in marks}
-    for one in with_frames(Recording(take).entries()):
-        if one.index in wanted:
-            yield _decoded(one)
-        if one.index >= marks[-1].index:
+def _mark(one: RecordedSet) -> FrameMark | None:
+    exposed_ns = [time_ns for time_ns in one.timestamps_ns.values() if time_ns is not None]
+    if not exposed_ns:
+        return None
+    return FrameMark(one.index, one.taken_ns, max(0, min(exposed_ns) - _CLOCKS_APART_NS))
+
+
+def _carried(recording: Recording) -> RigCalibration | None:
+    """The calibration in a recording; one that cannot be read must not keep from using another."""
+    if CALIBRATION not in recording.attachments:
+        return None
+    try:
+        return RigCalibration.from_dict(recording.document(CALIBRATION))
+    except DataError as error:
+        logger.warning("the calibration in %s is left out: %s", recording.path, error)
+        return None
+
+
+def _recorded(recording: Recording, marks: Sequence[FrameMark]) -> Iterator[PanoramicFrame]:
+    wanted, last = {(mark.time_ns, mark.index) for mark in marks}, (marks[-1].time_ns, marks[-1].index)
+    for one in with_frames(recording.entries(min(mark.from_ns for mark in marks))):
+        place = (one.time_ns, one.index)
+        if place in wanted:
+            frames = {camera_id: _decoded(frame) for camera_id, frame in one.frames.items()}
+            if any(frames.values()):
+                yield PanoramicFrame.of(one.index, frames)
+        if place >= last:
             return
 
 
-def _decoded(one: EncodedSet) -> PanoramicFrame:
-    return PanoramicFrame.of(one.index, {camera_id: _frame(held) for camera_id, held in one.frames.items()})
+def _decoded(frame: EncodedFrame | None) -> RgbdFrame | None:
+    if frame is None:
+        return None
+    try:
+        return decode_frame(frame)
+    except DataError as error:
+        logger.warning("camera %d, frame %d is left out: %s", frame.camera_id, frame.sequence, error)
+        return None
 
 
-def _frame(held: EncodedFrame | None) -> RgbdFrame | None:
-    return None if held is None else decode_frame(held)
-
-
-def _of_folder(folder: Path, description: RigDescription, index: int) -> PanoramicFrame:
-    frames: dict[int, RgbdFrame | None] = {
-        camera.id: read_frame(folder, camera, index) if index in frame_indices(folder, camera.name) else None
-        for camera in description.cameras
+def _of_folder(
+    folder: Path, description: RigDescription, marks: Sequence[FrameMark]
+) -> Iterator[PanoramicFrame]:
+    held: Mapping[int, set[int]] = {
+        camera.id: set(frame_indices(folder, camera.name)) for camera in description.cameras
     }
-    return PanoramicFrame.of(index, frames)
+    for mark in marks:
+        frames = {
+            camera.id: read_frame(folder, camera, mark.index) if mark.index in held[camera.id] else None
+            for camera in description.cameras
+        }
+        yield PanoramicFrame.of(mark.index, frames)
