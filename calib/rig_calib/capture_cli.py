@@ -40,18 +40,22 @@ _EXPORT_EXAMPLES = """
 
 def fuse(
     folder: Folder,
-    calibration: Annotated[Path, typer.Option(help="The calibration.json of this rig.")],
     out: Out,
+    calibration: Calibration = None,
     frames: Frames = None,
 ) -> None:
     """Fuse a rig folder or a recording with a calibration into cloud.ply and panorama.png."""
     from rich.console import Console
 
+    from rig_calib.offline.capture import open_capture
     from rig_calib.outputs import make_output_folder, write_fused
     from rig_calib.rig_calibration import RigCalibration
     from rig_calib.rig_folder_calibration import read_description, read_views
+    from rig_protocol.errors import ConfigurationError
 
-    known = RigCalibration.load(calibration)
+    known = open_capture(folder).calibration if calibration is None else RigCalibration.load(calibration)
+    if known is None:
+        raise ConfigurationError(f"{folder} carries no calibration: name it with --calibration FILE")
     views = read_views(folder, read_description(folder), frames)
     make_output_folder(out)
     fused = write_fused(out, known, views)
@@ -157,10 +161,12 @@ def _export_frames(
     from rig_calib.terminal import progress_bar
     from rig_protocol.errors import ConfigurationError
 
-    exporter, capture = FORMATS[form].exporter(), open_capture(path)
+    chosen_format = FORMATS[form]
+    exporter, capture = chosen_format.exporter(), open_capture(path)
     positions = range(*chosen.indices(len(capture.marks)))
     if not positions:
         raise ConfigurationError(f"{path} holds {len(capture.marks)} panoramic frames: none is left")
+    chosen_format.check(out, len(positions))
     known = capture.calibration if calibration is None else RigCalibration.load(calibration)
     with progress_bar(console) as tell, open_workers(workers, scheduler) as hands:
         exported = exporter(

@@ -7,6 +7,7 @@ import json
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import closing
 from dataclasses import dataclass
+from datetime import datetime
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -164,6 +165,19 @@ class Recording:
         return max(chunk.end_ns for chunk in self._chunks())
 
     @property
+    def utc_minus_rig_time_ns(self) -> int | None:
+        """What makes Unix time of rig time, to a second; None where the take does not tell its date."""
+        about = self._parts[0].contents.metadata[TAKE]
+        rig_time_ns = _created_rig_time_ns(about)
+        try:
+            created = datetime.fromisoformat(about.get("created", ""))
+        except ValueError:
+            return None
+        if rig_time_ns == 0 or created.tzinfo is None:
+            return None
+        return round(created.timestamp()) * 1_000_000_000 - rig_time_ns
+
+    @property
     def attachments(self) -> dict[str, bytes]:
         """By name; the last of a name counts."""
         return {name: data for part in self._parts for name, data in part.contents.attachments.items()}
@@ -256,7 +270,7 @@ def _recover_part(path: Path) -> bool:
 
 def _rewrite(path: Path, contents: Contents, output: Any) -> None:
     about = contents.metadata[TAKE]
-    writer = RecordingWriter(output, about.get("created", ""), 0)
+    writer = RecordingWriter(output, about.get("created", ""), _created_rig_time_ns(about))
     for name, data in contents.attachments.items():
         try:
             writer.attach(name, json.loads(data), 0)
@@ -265,6 +279,12 @@ def _rewrite(path: Path, contents: Contents, output: Any) -> None:
     for entry in _entries_of(path, contents, 0, leave_out_damaged=True):
         writer.write(entry)
     writer.finish()
+
+
+def _created_rig_time_ns(about: Mapping[str, str]) -> int:
+    """Rig time at which a take began; 0 where it does not tell."""
+    told = about.get("created_rig_time_ns", "")
+    return int(told) if told.isdecimal() and len(told) < 20 else 0
 
 
 def _reads_well(path: Path, contents: Contents) -> bool:

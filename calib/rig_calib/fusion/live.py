@@ -175,6 +175,11 @@ class LiveFusion:
             skipped=tuple(skipped),
         )
 
+    @property
+    def T_rig_depth(self) -> dict[int, Pose]:
+        """Where every camera's depth image is seen from, by camera id."""
+        return {i: grid.T_rig_grid for i, grid in zip(self.camera_ids, self._grids, strict=True)}
+
     def _grid(
         self, calibration: RigCalibration, models: Mapping[int, CameraModel], camera_id: int
     ) -> PlacedGrid:
