@@ -35,6 +35,10 @@ _EXPORT_EXAMPLES = """
 `rig-calib export results/calibration.json --format ros2 --out rig.launch.py` — the calibration, for a program
 
 `rig-calib export take.mcap --format foxglove --out view.mcap` — images, cloud and transforms, for Foxglove
+
+`rig-calib export take.mcap --format ply --out clouds --workers 4` — four processes of this machine
+
+`rig-calib export /nfs/take.mcap --format ply --out /nfs/clouds --scheduler tcp://10.0.0.1:8786` — a cluster
 """
 
 

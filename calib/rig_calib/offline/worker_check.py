@@ -24,7 +24,7 @@ def check_workers(client: Any, address: str, captures: Iterable[Capture]) -> Non
     except TimeoutError:
         raise ConfigurationError(
             f"the Dask scheduler at {address} has no workers: start some with "
-            f"`dask worker {address} --nworkers auto --nthreads 1`"
+            f"`dask worker {address} --nworkers -1 --nthreads 1`"
         ) from None
     files = [str(path) for capture in captures for path in _files_of(capture.path)]
     look = _look_of(_PACKAGE)
