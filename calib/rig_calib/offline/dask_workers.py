@@ -9,6 +9,7 @@ from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import CancelledError
 from contextlib import AbstractContextManager, ExitStack, contextmanager
+from multiprocessing import resource_tracker
 from typing import Any, TypeVar
 
 import cv2
@@ -154,11 +155,21 @@ def _work_on(work: Callable[[Batch], Result], capture: Capture, positions: range
 
 def _start_processes(stack: ExitStack, count: int) -> Client:
     """Only who holds the keys that are made here can speak to them: what they are told is what they run."""
+    resource_tracker.ensure_running()  # it would let the interrupts through that are held here
     stack.enter_context(_environment_kept())
     with _interrupts_held(), _environment_kept():
         stack.enter_context(dask.config.set(LOCAL_SETTINGS))
         folder = stack.enter_context(tempfile.TemporaryDirectory(prefix="rig-calib-"))
-        cluster = LocalCluster(
+        cluster = stack.enter_context(_processes(count, folder))
+        stack.enter_context(_quiet())
+        client = Client(cluster, set_as_default=False, direct_to_workers=True)
+        stack.enter_context(client)
+        return client
+
+
+def _processes(count: int, folder: str) -> LocalCluster:
+    try:
+        return LocalCluster(
             n_workers=count,
             threads_per_worker=1,
             host="127.0.0.1",
@@ -170,11 +181,8 @@ def _start_processes(stack: ExitStack, count: int) -> Client:
             local_directory=folder,
             silence_logs=logging.CRITICAL,
         )
-        stack.enter_context(cluster)
-        stack.enter_context(_quiet())
-        client = Client(cluster, set_as_default=False, direct_to_workers=True)
-        stack.enter_context(client)
-        return client
+    except (RuntimeError, OSError) as error:
+        raise RigError(f"{count} processes do not start ({error}): fewer --workers need less") from error
 
 
 def _quiet() -> AbstractContextManager[ExitStack]:
