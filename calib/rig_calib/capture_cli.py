@@ -51,15 +51,11 @@ def fuse(
     """Fuse a rig folder or a recording with a calibration into cloud.ply and panorama.png."""
     from rich.console import Console
 
-    from rig_calib.offline.capture import open_capture
     from rig_calib.outputs import make_output_folder, write_fused
-    from rig_calib.rig_calibration import RigCalibration
+    from rig_calib.recorded_calibration import calibration_for
     from rig_calib.rig_folder_calibration import read_description, read_views
-    from rig_protocol.errors import ConfigurationError
 
-    known = open_capture(folder).calibration if calibration is None else RigCalibration.load(calibration)
-    if known is None:
-        raise ConfigurationError(f"{folder} carries no calibration: name it with --calibration FILE")
+    known = calibration_for(folder, calibration)
     views = read_views(folder, read_description(folder), frames)
     make_output_folder(out)
     fused = write_fused(out, known, views)

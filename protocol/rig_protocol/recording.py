@@ -14,6 +14,7 @@ from typing import Any, Protocol
 from rig_protocol.errors import DataError, RigError
 from rig_protocol.mcap_scan import ChunkPlace, Contents, chunk_messages, open_recording, scan, topic_messages
 from rig_protocol.recording_format import (
+    CLOCK,
     DROPS,
     PROFILE,
     SETS,
@@ -23,6 +24,7 @@ from rig_protocol.recording_format import (
     Entry,
     EntryParser,
     RecordedSet,
+    clock_schema,
     drop_schema,
     image_schema,
     pack_entry,
@@ -62,8 +64,11 @@ class RecordingWriter:
     What was flushed survives the end of this process. `finish` adds the indexes that make any reader quick.
     """
 
-    def __init__(self, output: Output, created: str, now_ns: int) -> None:
-        """`created`: date and time in words (ISO 8601); `now_ns`: the same moment in rig time."""
+    def __init__(self, output: Output, created: str, now_ns: int, clock: str | None = None) -> None:
+        """`created`: date and time in words (ISO 8601); `now_ns`: the same moment in the take's clock.
+
+        `clock`: the name of that clock, where others may know it.
+        """
         from mcap.writer import CompressionType, Writer
 
         self._output = output
@@ -72,6 +77,8 @@ class RecordingWriter:
         self._writer: Any = Writer(stream, chunk_size=_CHUNK_BYTES, compression=CompressionType.NONE)
         self._writer.start(profile=PROFILE, library=PROFILE)
         about = {"version": str(VERSION), "created": created, "created_rig_time_ns": str(now_ns)}
+        if clock is not None:
+            about["clock"] = clock
         self._writer.add_metadata(TAKE, about)
         self._channels: dict[str, int] = {}
         self._attached: dict[str, bytes] = {}
@@ -130,6 +137,7 @@ class RecordingWriter:
 _SCHEMAS: dict[str, tuple[str, Callable[[], bytes]]] = {
     SETS: ("kinect_rig.Set", set_schema),
     DROPS: ("kinect_rig.DroppedFrames", drop_schema),
+    CLOCK: ("kinect_rig.Clock", clock_schema),
 }
 
 
@@ -153,6 +161,11 @@ class Recording:
     def torn(self) -> tuple[Path, ...]:
         """The parts that were not finished: what was flushed is read, the summary is absent."""
         return tuple(part.path for part in self._parts if not part.contents.sound)
+
+    @property
+    def clock(self) -> str | None:
+        """Name of the clock of all its times; None where it was not told."""
+        return self._parts[0].contents.metadata[TAKE].get("clock")
 
     @property
     def start_ns(self) -> int:
@@ -270,7 +283,9 @@ def _recover_part(path: Path) -> bool:
 
 def _rewrite(path: Path, contents: Contents, output: Any) -> None:
     about = contents.metadata[TAKE]
-    writer = RecordingWriter(output, about.get("created", ""), _created_rig_time_ns(about))
+    writer = RecordingWriter(
+        output, about.get("created", ""), _created_rig_time_ns(about), about.get("clock")
+    )
     for name, data in contents.attachments.items():
         try:
             writer.attach(name, json.loads(data), 0)

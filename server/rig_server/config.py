@@ -11,13 +11,15 @@ from rig_protocol.camera import CameraModel
 from rig_protocol.datagram import MIN_DATAGRAM_SIZE
 from rig_protocol.errors import ConfigurationError, DataError
 from rig_protocol.events import Address
+from rig_protocol.recorder import TakeSettings
 from rig_protocol.rig_folder import RingDrawing, read_json
 from rig_protocol.settings import Settings, load_settings
-from rig_server.synchroniser import Policy
+from rig_protocol.synchroniser import Policy
 
 ENVIRONMENT_PREFIX = "RIG_SERVER_"
 CONFIG_PLACES = (Path("rig.toml"), Path("/etc/kinect-rig/rig.toml"))
 DEFAULT_PORT = 4012
+MAX_SETS = 100  # of one calibration: more average nothing away, and fill the memory
 MAX_CAMERAS = 64  # what one server holds in memory and one roster names; a ring has twelve
 CAMERA_NAME = r"^[A-Za-z0-9][A-Za-z0-9_.-]{0,31}$"  # it names folders and files
 
@@ -102,7 +104,7 @@ class LinkSettings(Settings):
 class CaptureSettings(Settings):
     """What `--calibrate` waits for and collects."""
 
-    frames: int = Field(5, ge=1, le=100)
+    frames: int = Field(5, ge=1, le=MAX_SETS)
     """Panoramic frames to calibrate on."""
     target_deg: float | None = Field(None, gt=0, le=180, examples=[0.1])
     """End as soon as every pair of neighbours is expected to be known this well (root mean square)."""
@@ -123,15 +125,11 @@ class WatchSettings(Settings):
     """It looks at one panoramic frame in so many; a look at twelve cameras takes some 60 ms of one core."""
 
 
-class RecordingSettings(Settings):
+class RecordingSettings(TakeSettings):
     """How `--record FILE.mcap` records (docs/recording.md)."""
 
-    part_gib: float = Field(16.0, gt=0, le=1024)
-    """Size from which on the recording goes on in another file: FILE.001.mcap, FILE.002.mcap, ..."""
-    keep_free_mib: int = Field(64, ge=0, le=1 << 30)
-    """Room on the disk that a recording leaves: where there is less, it ends in order."""
-    queue_mib: int = Field(256, ge=8, le=1 << 20)
-    """Memory for frames that wait for a slow disk; what does not fit is dropped, and told in the file."""
+    folder: Path = Path()
+    """Where takes go that are begun while the server runs; relative to where it was started."""
 
 
 class RigSettings(Settings):

@@ -10,6 +10,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+from rig_calib.rig_calibration import RigCalibration
 from rig_protocol.codecs import COLOR_CODECS, DEPTH_CODECS
 from rig_protocol.errors import RigError
 from rig_protocol.events import (
@@ -23,11 +24,14 @@ from rig_protocol.events import (
 )
 from rig_protocol.frames import PanoramicFrame, RgbdFrame
 from rig_protocol.messages import ControlValue, Hello
+from rig_protocol.recorder import RecordingStatus, TakeContext
+from rig_protocol.recording_format import UTC, ClockReading, ClockTie
 from rig_protocol.rig_folder import RigDescription
 from rig_protocol.rig_key import RigKey
 from rig_protocol.roster import Roster, Slot, known_serial
 from rig_protocol.server_link import ServerLink
-from rig_protocol.system_clock import SystemClock
+from rig_protocol.synchroniser import Synchroniser
+from rig_protocol.system_clock import SystemClock, boot_clock_name
 from rig_protocol.troubleshooting import Topic, see
 from rig_server.assembler import Assembler
 from rig_server.attendance import absence_message, is_whole
@@ -36,14 +40,13 @@ from rig_server.decoder import FrameDecoder
 from rig_server.description import describe_rig
 from rig_server.durations import Durations
 from rig_server.link_budget import Port
-from rig_server.metrics import RecordingStatus, RigStatus
+from rig_server.metrics import RigStatus
 from rig_server.receiver import Receiver, rig_time_ns
 from rig_server.remote_control import RemoteControl
 from rig_server.rig_status import StatusReader
 from rig_server.sinks.record import RecordSink
 from rig_server.stream_control import StreamControl
 from rig_server.stream_planner import StreamPlanner
-from rig_server.synchroniser import Synchroniser
 from rig_server.take_documents import take_documents
 from rig_server.unassigned import UnassignedAgents
 
@@ -64,6 +67,7 @@ class LivePipeline:
 
     def __init__(self, settings: RigSettings, key: RigKey, record: Path | None = None) -> None:
         """`record`: the file to record to."""
+        self.calibration: RigCalibration | None = None
         self._settings = settings
         self._durations = Durations()
         self._assembler = Assembler(_synchroniser(settings), self._durations.set_delivered)
@@ -77,6 +81,7 @@ class LivePipeline:
             datagram_size=Port(settings.link.speed_mbit, settings.link.mtu).datagram_size,
             objection=planner.objection,
         )
+        self._link.rig_clock = boot_clock_name()
         self._streams = StreamControl(self._link, planner)
         self._receiver = Receiver(
             self._link,
@@ -138,10 +143,14 @@ class LivePipeline:
             self.start_recording(self._take)
         self._receiver.start()
 
-    def stop(self) -> None:
-        """Say goodbye to the cameras and end all threads; harmless when already stopped."""
+    def end_sets(self) -> None:
+        """Say goodbye to the cameras and end all threads but that of a recording, which stays open."""
         self._receiver.stop()
         self._decoder.close()
+
+    def stop(self) -> None:
+        """End all of it; harmless when already stopped."""
+        self.end_sets()
         self.stop_recording()
 
     def start_recording(self, take: Path) -> None:
@@ -152,7 +161,10 @@ class LivePipeline:
         with self._recording:
             if self._record is not None and self._record.status().ended is None:
                 raise RigError(f"{self._record.status().path} is being recorded: stop that first")
-            record = RecordSink(take, self._settings.recording, self._documents, self._camera_counts)
+            context = TakeContext(
+                self._documents, self._camera_counts, self._clock_reading, self._link.rig_clock
+            )
+            record = RecordSink(take, self._settings.recording, context)
             record.start()
             self._record = record
 
@@ -232,7 +244,8 @@ class LivePipeline:
                     record.add_frame(frame)
                 self._decoder.submit(frame)
             case CameraJoined(camera_id, hello, address):
-                self._assembler.camera_joined(camera_id, hello.fps)
+                if hello.color_codecs or hello.depth_codecs:  # sets wait for no camera that only records
+                    self._assembler.camera_joined(camera_id, hello.fps)
                 with self._presence:
                     self._connected.add(camera_id)
                     self._hellos[camera_id] = hello
@@ -256,7 +269,15 @@ class LivePipeline:
 
     def _documents(self) -> Mapping[str, Any]:
         """What a recording tells of the rig, as it is now."""
-        return take_documents(self._settings, self.description, self.hellos)
+        return take_documents(self._settings, self.description, self.hellos, self.calibration)
+
+    def _clock_reading(self) -> ClockReading | None:
+        """The rig clock against the world's, where something disciplines this machine's."""
+        system_clock = self._link.system_clock
+        if system_clock is None or system_clock.error_ns is None:
+            return None
+        tie = ClockTie(UTC, system_clock.wall_minus_monotonic_ns, system_clock.error_ns)
+        return ClockReading(rig_time_ns(), (tie,))
 
     def _camera_counts(self) -> Mapping[str, Mapping[str, int]]:
         """What came of every camera, and what was lost on the way."""

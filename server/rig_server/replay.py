@@ -4,28 +4,29 @@ import logging
 import threading
 import time
 from collections import Counter
-from collections.abc import Collection, Iterable, Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
+from rig_calib.recorded_calibration import recorded_calibration
+from rig_calib.rig_calibration import RigCalibration
 from rig_protocol.codecs import keep_freed_memory
 from rig_protocol.decoding import decode_frame
 from rig_protocol.errors import ConfigurationError, DataError, RigError
 from rig_protocol.events import ControlAnswered
 from rig_protocol.frames import EncodedFrame, PanoramicFrame, RgbdFrame
 from rig_protocol.messages import ControlValue, Hello
-from rig_protocol.recorded_sets import EncodedSet, with_frames
+from rig_protocol.recorded_hellos import recorded_hellos
+from rig_protocol.recorded_sets import EncodedSet, synchroniser_of, with_frames, with_sets
 from rig_protocol.recording import HELLOS, Recording
-from rig_protocol.recording_format import Entry, RecordedSet, time_of
+from rig_protocol.recording_format import Entry
 from rig_protocol.rig_folder import RigDescription
 from rig_protocol.roster import Slot
 from rig_server.config import RigSettings
 from rig_server.metrics import CameraMetrics, RateMeter, RigStatus
 from rig_server.receiver import rig_time_ns
-from rig_server.synchroniser import Synchroniser
-from rig_server.take_documents import recorded_hellos
 
 logger = logging.getLogger(__name__)
 
@@ -54,6 +55,7 @@ class ReplayedRig:
         self._recording, self._settings, self._options = Recording(take), settings, options
         self.description: RigDescription = self._recording.description
         self.hellos: dict[int, Hello] = recorded_hellos(self._recording.document(HELLOS), self.description)
+        self.calibration = _calibration_of(self._recording)
         self._has_sets = self._recording.has_sets
         span_s = (self._recording.end_ns - self._recording.start_ns) / 1e9
         if options.seek_s > span_s:
@@ -79,6 +81,10 @@ class ReplayedRig:
 
     def start(self) -> None:
         """A file is always there."""
+
+    def end_sets(self) -> None:
+        """End the decoders; harmless when already ended."""
+        self.stop()
 
     def stop(self) -> None:
         """End the decoders; harmless when already ended."""
@@ -163,15 +169,9 @@ class ReplayedRig:
         if self._has_sets:
             return entries
         options = self._settings.synchroniser
-        synchroniser = Synchroniser(
-            self.description.camera_ids,
-            deadline_ns=int(options.deadline_ms * 1e6),
-            max_spread_ns=None if options.max_spread_ms is None else int(options.max_spread_ms * 1e6),
-            policy=options.policy,
-        )
-        for camera_id, hello in self.hellos.items():
-            synchroniser.camera_joined(camera_id, hello.fps)
-        return with_sets(entries, synchroniser)
+        spread_ns = None if options.max_spread_ms is None else int(options.max_spread_ms * 1e6)
+        deadline_ns = int(options.deadline_ms * 1e6)
+        return with_sets(entries, synchroniser_of(self.hellos, deadline_ns, spread_ns, options.policy))
 
     def _decoded(self, one: EncodedSet) -> PanoramicFrame | None:
         decode = partial(_decode, demosaic=self._settings.demosaic)
@@ -188,29 +188,13 @@ class ReplayedRig:
         return panorama
 
 
-def with_sets(entries: Iterable[Entry], synchroniser: Synchroniser) -> Iterator[Entry]:
-    """The entries of a take without sets, and the sets that the synchroniser makes, in recorded time."""
-    now_ns = 0
-    for entry in entries:
-        yield entry
-        if isinstance(entry, EncodedFrame):
-            now_ns = max(now_ns, time_of(entry))
-            synchroniser.add(_without_images(entry), now_ns)
-            yield from _sets_due(synchroniser, now_ns)
-    while synchroniser.waiting and (due_ns := synchroniser.next_timeout_ns()) is not None:
-        waiting, now_ns = synchroniser.waiting, max(now_ns, due_ns)
-        yield from _sets_due(synchroniser, now_ns)
-        if synchroniser.waiting == waiting:
-            return
-
-
-def _sets_due(synchroniser: Synchroniser, now_ns: int) -> Iterator[RecordedSet]:
-    while (panorama := synchroniser.next_panorama(now_ns)) is not None:
-        yield RecordedSet.of(panorama, now_ns)
-
-
-def _without_images(frame: EncodedFrame) -> RgbdFrame:
-    return RgbdFrame(frame.camera_id, frame.sequence, frame.timestamp_ns, frame.uncertainty_ns)
+def _calibration_of(recording: Recording) -> RigCalibration | None:
+    """The one that the take brings; one that cannot be read is no reason not to play its images."""
+    try:
+        return recorded_calibration(recording)
+    except DataError as error:
+        logger.warning("%s; the take plays without it", error)
+        return None
 
 
 def _decode(frame: EncodedFrame | None, demosaic: bool) -> RgbdFrame | None:

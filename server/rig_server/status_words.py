@@ -3,6 +3,7 @@
 from collections.abc import Mapping
 
 from rig_calib.drift.words import moved_message
+from rig_protocol.recorder import RecordingStatus
 from rig_server.durations import (
     EXPOSURE_TO_RECEIVED,
     RECEIVED_TO_DECODED,
@@ -10,7 +11,7 @@ from rig_server.durations import (
     UNCERTAINTY,
 )
 from rig_server.histogram import HistogramSnapshot
-from rig_server.metrics import RecordingStatus, RigStatus
+from rig_server.metrics import RigStatus
 
 _STAGES = {
     EXPOSURE_TO_RECEIVED: "arrival",
@@ -53,6 +54,14 @@ def alarms(status: RigStatus) -> list[str]:
     if status.drift.failure is not None:
         told.append(f"the drift watch has ended: {status.drift.failure}; start the server again")
     return told
+
+
+def recorded(recording: RecordingStatus) -> str:
+    """How a recording was that has been ended."""
+    told = f"recorded {_duration(recording.seconds)}, {recording.bytes / 1e9:.2f} GB to {recording.path}"
+    if recording.dropped:
+        told += f"; the disk was too slow for {recording.dropped} frames"
+    return told + (f"; it had ended before: {recording.ended}" if recording.ended is not None else "")
 
 
 def _recording(recording: RecordingStatus) -> str:

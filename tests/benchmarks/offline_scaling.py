@@ -201,7 +201,8 @@ def report(results: Mapping[str, Any]) -> str:
 `tests/benchmarks/offline_scaling.py` on {machine("numpy", "numba", "distributed")};
 {load}, other programs' included. `rig-calib export` of {results["frames"]}
 panoramic frames of twelve simulated Kinects, the quickest of {REPEATS} runs. One worker is held to one core.
-The machine has {cores}: efficiency is against so many times one worker, and more workers only show what too many cost.
+The machine has {cores}: efficiency is against so many times one worker, and more workers only show what too
+many cost.
 
 {scaling_table(results)}
 

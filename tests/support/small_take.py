@@ -8,6 +8,8 @@ import numpy as np
 from rig_protocol.camera import CameraModel
 from rig_protocol.codecs import codec_by_name
 from rig_protocol.frames import EncodedFrame, Payload
+from rig_protocol.messages import Hello
+from rig_protocol.recorded_hellos import told_hellos
 from rig_protocol.recording import DESCRIPTION, RecordingWriter
 from rig_protocol.recording_format import Entry, RecordedSet
 from rig_protocol.rig_folder import CameraEntry, RigDescription
@@ -43,15 +45,25 @@ def entries(sets: int) -> list[Entry]:
     return [entry for k in range(sets) for entry in (encoded(0, k), encoded(1, k), of_set(k))]
 
 
-def write_take(path: Path, taken: Sequence[Entry], finish: bool = True, **attached: object) -> Path:
-    """Write it, a chunk after every set; `finish`: with the indexes of the end."""
+def hello_documents() -> dict[str, object]:
+    """What tells the agents of both cameras."""
+    fps = 1e9 / PERIOD_NS
+    return told_hellos(
+        {i: Hello(f"cam0{i}", i, None, None, CameraModel(), (), (), fps, "test") for i in (0, 1)}
+    )
+
+
+def write_take(
+    path: Path, taken: Sequence[Entry], finish: bool = True, flush_every: int = 3, **attached: object
+) -> Path:
+    """Write it, a chunk after so many entries; `finish`: with the indexes of the end."""
     with path.open("wb") as output:
         writer = RecordingWriter(output, "", 0)
         for name, values in {DESCRIPTION: RIG.to_dict(), **attached}.items():
             writer.attach(name, values, 0)
-        for entry in taken:
+        for count, entry in enumerate(taken, 1):
             writer.write(entry)
-            if isinstance(entry, RecordedSet):
+            if count % flush_every == 0:
                 writer.flush()
         if finish:
             writer.finish()

@@ -1,18 +1,20 @@
 """A capture on disk, rig folder or recording, whose panoramic frames can be read from any place on."""
 
 import logging
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
+from rig_calib.recorded_calibration import recorded_calibration
 from rig_calib.recorded_panoramas import is_recording
 from rig_calib.rig_calibration import RigCalibration
 from rig_protocol.decoding import decode_frame
 from rig_protocol.errors import ConfigurationError, DataError
 from rig_protocol.frames import EncodedFrame, PanoramicFrame, RgbdFrame
-from rig_protocol.recorded_sets import with_frames
-from rig_protocol.recording import CALIBRATION, Recording
-from rig_protocol.recording_format import RecordedSet
+from rig_protocol.recorded_hellos import recorded_hellos
+from rig_protocol.recorded_sets import synchroniser_of, with_frames, with_sets
+from rig_protocol.recording import HELLOS, Recording
+from rig_protocol.recording_format import Entry, RecordedSet, time_of
 from rig_protocol.rig_folder import RigDescription, frame_indices, read_frame, read_rig_description
 
 logger = logging.getLogger(__name__)
@@ -38,7 +40,8 @@ class Capture:
     """What is known of a capture without reading its images; small, and understood by other processes.
 
     `marks`: its panoramic frames, in order; a position is an index into them. `calibration`: the one that
-    the recording carries.
+    the recording carries. `grouped`: the sets of a recording that has none (an agent's), as the synchroniser
+    makes them.
     """
 
     path: Path
@@ -46,6 +49,7 @@ class Capture:
     marks: tuple[FrameMark, ...]
     calibration: RigCalibration | None = None
     recording: Recording | None = None
+    grouped: tuple[RecordedSet, ...] = ()
 
     def read(self, positions: range) -> Iterator[PanoramicFrame]:
         """The panoramic frames there, complete or not, one by one; one without any image is left out.
@@ -57,7 +61,7 @@ class Capture:
         if not marks:
             return
         if is_recording(self.path):
-            yield from _recorded(self.recording or Recording(self.path), marks)
+            yield from _recorded(self.recording or Recording(self.path), self.grouped, marks)
         else:
             yield from _of_folder(self.path, self.description, marks)
 
@@ -70,13 +74,19 @@ def open_capture(path: Path) -> Capture:
 
 def _open_recording(path: Path) -> Capture:
     recording = Recording(path)
-    marks = tuple(mark for one in recording.sets() if (mark := _mark(one)) is not None)
+    sets = tuple(recording.sets())
+    grouped = () if sets else _grouped(recording)
+    marks = tuple(mark for one in sets or grouped if (mark := _mark(one)) is not None)
     if not marks:
-        raise ConfigurationError(
-            f"{path} holds no sets: nobody took panoramic frames while it was recorded. What `rig-server "
-            "--record` writes has them; `rig-server --replay` groups the frames of this one as it plays"
-        )
-    return Capture(path, recording.description, marks, _carried(recording), recording)
+        raise ConfigurationError(f"{path} holds no panoramic frames")
+    return Capture(path, recording.description, marks, recorded_calibration(recording), recording, grouped)
+
+
+def _grouped(recording: Recording) -> tuple[RecordedSet, ...]:
+    """All is read for it, once."""
+    hellos = recorded_hellos(recording.document(HELLOS), recording.description)
+    entries = with_sets(recording.entries(), synchroniser_of(hellos))
+    return tuple(entry for entry in entries if isinstance(entry, RecordedSet))
 
 
 def _open_folder(path: Path) -> Capture:
@@ -94,20 +104,12 @@ def _mark(one: RecordedSet) -> FrameMark | None:
     return FrameMark(one.index, one.taken_ns, max(0, min(exposed_ns) - _CLOCKS_APART_NS))
 
 
-def _carried(recording: Recording) -> RigCalibration | None:
-    """The calibration in a recording; one that cannot be read must not keep from using another."""
-    if CALIBRATION not in recording.attachments:
-        return None
-    try:
-        return RigCalibration.from_dict(recording.document(CALIBRATION))
-    except DataError as error:
-        logger.warning("the calibration in %s is left out: %s", recording.path, error)
-        return None
-
-
-def _recorded(recording: Recording, marks: Sequence[FrameMark]) -> Iterator[PanoramicFrame]:
+def _recorded(
+    recording: Recording, grouped: Sequence[RecordedSet], marks: Sequence[FrameMark]
+) -> Iterator[PanoramicFrame]:
     wanted, last = {(mark.time_ns, mark.index) for mark in marks}, (marks[-1].time_ns, marks[-1].index)
-    for one in with_frames(recording.entries(min(mark.from_ns for mark in marks))):
+    entries = recording.entries(min(mark.from_ns for mark in marks))
+    for one in with_frames(_with(grouped, entries) if grouped else entries):
         place = (one.time_ns, one.index)
         if place in wanted:
             frames = {camera_id: _decoded(frame) for camera_id, frame in one.frames.items()}
@@ -115,6 +117,20 @@ def _recorded(recording: Recording, marks: Sequence[FrameMark]) -> Iterator[Pano
                 yield PanoramicFrame.of(one.index, frames)
         if place >= last:
             return
+
+
+def _with(grouped: Iterable[RecordedSet], entries: Iterable[Entry]) -> Iterator[Entry]:
+    """The entries, and every set behind what had come when it was made."""
+    sets = iter(grouped)
+    coming = next(sets, None)
+    for entry in entries:
+        while coming is not None and coming.taken_ns < time_of(entry):
+            yield coming
+            coming = next(sets, None)
+        yield entry
+    if coming is not None:
+        yield coming
+        yield from sets
 
 
 def _decoded(frame: EncodedFrame | None) -> RgbdFrame | None:

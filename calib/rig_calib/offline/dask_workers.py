@@ -35,7 +35,9 @@ _LOOK_S = 2.0
 _ONE_THREAD = dict.fromkeys(
     ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS", "NUMBA_NUM_THREADS"), "1"
 )
+_SETTINGS = {"distributed.admin.large-graph-warning-threshold": "1GB"}  # a capture of hours is some 10 MB
 LOCAL_SETTINGS: dict[str, Any] = {
+    **_SETTINGS,
     "distributed.scheduler.allowed-failures": _DEATHS,
     "distributed.scheduler.http.routes": [],  # pages for everybody who has an account here
     "distributed.worker.http.routes": [],
@@ -61,7 +63,7 @@ def open_cluster(address: str) -> Iterator["DaskWorkers"]:
 
     For tls:// Dask's own configuration names the certificates.
     """
-    with _quiet():
+    with _quiet(), dask.config.set(_SETTINGS):
         try:
             client = Client(address, timeout=CONNECT_S, set_as_default=False)
         except (OSError, TypeError, ValueError) as error:

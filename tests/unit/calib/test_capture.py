@@ -14,10 +14,10 @@ from rig_calib.offline.capture import open_capture
 from rig_protocol.errors import ConfigurationError, DataError
 from rig_protocol.frames import PanoramicFrame, Payload, RgbdFrame
 from rig_protocol.mcap_scan import ChunkPlace, chunk_messages, scan
-from rig_protocol.recording import CALIBRATION, Recording
+from rig_protocol.recording import CALIBRATION, HELLOS, Recording
 from rig_protocol.recording_format import RecordedSet
 from rig_protocol.rig_folder import write_rig_folder
-from support.small_take import COLOR, RIG, encoded, entries, write_take
+from support.small_take import COLOR, RIG, encoded, entries, hello_documents, write_take
 
 SETS = 20
 
@@ -125,19 +125,25 @@ def test_a_damaged_chunk_is_told_with_file_and_place(tmp_path: Path) -> None:
         list(capture.read(range(8, 16)))
 
 
-def test_a_take_without_sets_is_refused_in_words(tmp_path: Path) -> None:
-    taken = [entry for entry in entries(4) if not isinstance(entry, RecordedSet)]
-    with pytest.raises(ConfigurationError, match="holds no sets"):
-        open_capture(write_take(tmp_path / "take.mcap", taken))
-
-
-def test_a_calibration_that_cannot_be_read_is_told_and_left_out(
-    tmp_path: Path, caplog: pytest.LogCaptureFixture
+def test_a_take_without_sets_is_grouped_once_and_read_from_any_place(
+    tmp_path: Path, chunks_read: list[ChunkPlace]
 ) -> None:
+    """As an agent records it."""
+    taken = [entry for entry in entries(SETS) if not isinstance(entry, RecordedSet)]
+    path = write_take(tmp_path / "take.mcap", taken, flush_every=2, **{HELLOS: hello_documents()})
+    capture = pickle.loads(pickle.dumps(open_capture(path)))  # noqa: S301  # our own
+    whole = [pixels(one) for one in capture.read(range(len(capture.marks)))]
+    assert whole == [{0: k, 1: 10 + k} for k in range(SETS)]
+    chunks_read.clear()
+    assert [pixels(one) for one in capture.read(range(10, 12))] == whole[10:12]
+    assert len(chunks_read) < 6
+    assert [pixels(one) for k in range(SETS) for one in capture.read(range(k, k + 1))] == whole
+
+
+def test_a_calibration_that_cannot_be_read_is_told_with_its_file(tmp_path: Path) -> None:
     path = write_take(tmp_path / "take.mcap", entries(2), **{CALIBRATION: {"schema": 99}})
-    assert open_capture(path).calibration is None
-    assert "calibration in" in caplog.text
-    assert "not a calibration of schema 1" in caplog.text
+    with pytest.raises(DataError, match=r"take.mcap: calibration.json: not a calibration of schema 1"):
+        open_capture(path)
 
 
 def test_a_rig_folder_is_read_from_any_place_on(tmp_path: Path) -> None:
