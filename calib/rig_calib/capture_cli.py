@@ -37,6 +37,10 @@ _EXPORT_EXAMPLES = """
 `rig-calib export take.mcap --format foxglove --out view.mcap` — images, cloud and transforms, for Foxglove
 
 `rig-calib export take.mcap --format rig-folder --out rig --frames 5` — a rig folder, for `rig-calib solve`
+
+`rig-calib export take.mcap --format ply --out clouds --workers 4` — four processes of this machine
+
+`rig-calib export /nfs/take.mcap --format ply --out /nfs/clouds --scheduler tcp://10.0.0.1:8786` — a cluster
 """
 
 
