@@ -40,6 +40,12 @@ _EXPORT_EXAMPLES = """
 `rig-calib export results/calibration.json --format ros2 --out rig.launch.py` — the calibration, for a program
 
 `rig-calib export take.mcap --format foxglove --out view.mcap` — images, cloud and transforms, for Foxglove
+
+`rig-calib export take.mcap --format rig-folder --out rig --frames 5` — a rig folder, for `rig-calib solve`
+
+`rig-calib export take.mcap --format ply --out clouds --workers 4` — four processes of this machine
+
+`rig-calib export /nfs/take.mcap --format ply --out /nfs/clouds --scheduler tcp://10.0.0.1:8786` — a cluster
 """
 
 
@@ -115,7 +121,8 @@ def export(
         typer.Option(
             "--format",
             metavar="FORMAT",
-            help="kalibr, ros2, urdf, colmap, nerfstudio, opencv; of frames others. See docs/exports.md.",
+            help="kalibr, ros2, urdf, colmap, nerfstudio, opencv; of frames foxglove, rerun, tum, rig-folder "
+            "and others. See docs/exports.md.",
         ),
     ],
     out: Annotated[Path, typer.Option(help="File to write, or a folder, as the format has it.")],
@@ -143,7 +150,9 @@ def export(
     """Write a calibration, or the frames of a capture, for another program (docs/exports.md)."""
     from rich.console import Console
 
+    from rig_calib.exports.formats import FORMATS as CALIBRATION_FORMATS
     from rig_calib.frame_exports.formats import FORMATS
+    from rig_protocol.errors import ConfigurationError
 
     console = Console(highlight=False, soft_wrap=True)
     if form in FORMATS:
@@ -158,8 +167,11 @@ def export(
             workers,
             scheduler,
         )
-    else:
+    elif form in CALIBRATION_FORMATS:
         _export_calibration(console, form, source, out, rig, frames or 1)
+    else:
+        known = ", ".join((*CALIBRATION_FORMATS, *FORMATS))
+        raise ConfigurationError(f"format {form!r} is none of {known}")
 
 
 def _export_calibration(

@@ -12,8 +12,9 @@ from pathlib import Path
 from typing import Any, Protocol
 
 from rig_protocol.errors import DataError, RigError
-from rig_protocol.mcap_scan import ChunkPlace, Contents, chunk_messages, open_recording, scan
+from rig_protocol.mcap_scan import ChunkPlace, Contents, chunk_messages, open_recording, scan, topic_messages
 from rig_protocol.recording_format import (
+    CLOCK,
     DROPS,
     PROFILE,
     SETS,
@@ -23,6 +24,7 @@ from rig_protocol.recording_format import (
     Entry,
     EntryParser,
     RecordedSet,
+    clock_schema,
     drop_schema,
     image_schema,
     pack_entry,
@@ -62,8 +64,11 @@ class RecordingWriter:
     What was flushed survives the end of this process. `finish` adds the indexes that make any reader quick.
     """
 
-    def __init__(self, output: Output, created: str, now_ns: int) -> None:
-        """`created`: date and time in words (ISO 8601); `now_ns`: the same moment in rig time."""
+    def __init__(self, output: Output, created: str, now_ns: int, clock: str | None = None) -> None:
+        """`created`: date and time in words (ISO 8601); `now_ns`: the same moment in the take's clock.
+
+        `clock`: the name of that clock, where others may know it.
+        """
         from mcap.writer import CompressionType, Writer
 
         self._output = output
@@ -72,6 +77,8 @@ class RecordingWriter:
         self._writer: Any = Writer(stream, chunk_size=_CHUNK_BYTES, compression=CompressionType.NONE)
         self._writer.start(profile=PROFILE, library=PROFILE)
         about = {"version": str(VERSION), "created": created, "created_rig_time_ns": str(now_ns)}
+        if clock is not None:
+            about["clock"] = clock
         self._writer.add_metadata(TAKE, about)
         self._channels: dict[str, int] = {}
         self._attached: dict[str, bytes] = {}
@@ -130,6 +137,7 @@ class RecordingWriter:
 _SCHEMAS: dict[str, tuple[str, Callable[[], bytes]]] = {
     SETS: ("kinect_rig.Set", set_schema),
     DROPS: ("kinect_rig.DroppedFrames", drop_schema),
+    CLOCK: ("kinect_rig.Clock", clock_schema),
 }
 
 
@@ -153,6 +161,11 @@ class Recording:
     def torn(self) -> tuple[Path, ...]:
         """The parts that were not finished: what was flushed is read, the summary is absent."""
         return tuple(part.path for part in self._parts if not part.contents.sound)
+
+    @property
+    def clock(self) -> str | None:
+        """Name of the clock of all its times; None where it was not told."""
+        return self._parts[0].contents.metadata[TAKE].get("clock")
 
     @property
     def start_ns(self) -> int:
@@ -192,7 +205,7 @@ class Recording:
         """Whether the server's sets were recorded."""
         if any(SETS in part.contents.topics.values() for part in self._parts):
             return True
-        return bool(self.torn) and any(isinstance(entry, RecordedSet) for entry in self.entries())
+        return bool(self.torn) and next(self.sets(), None) is not None
 
     def document(self, name: str) -> Any:
         """An attached JSON document; DataError when it is absent or malformed."""
@@ -211,6 +224,15 @@ class Recording:
         """
         for part in self._parts:
             yield from _entries_of(part.path, part.contents, from_ns)
+
+    def sets(self) -> Iterator[RecordedSet]:
+        """The sets alone, in the order in which they were written: of what is indexed no image is read.
+
+        Thereafter `entries` skips to a time in parts that were not finished, too. DataError where the file is
+        damaged and that shows: check sums are for `entries`.
+        """
+        for part in self._parts:
+            yield from _sets_of(part.path, part.contents)
 
     def _chunks(self) -> list[ChunkPlace]:
         chunks = [chunk for part in self._parts for chunk in part.contents.chunks]
@@ -261,7 +283,9 @@ def _recover_part(path: Path) -> bool:
 
 def _rewrite(path: Path, contents: Contents, output: Any) -> None:
     about = contents.metadata[TAKE]
-    writer = RecordingWriter(output, about.get("created", ""), _created_rig_time_ns(about))
+    writer = RecordingWriter(
+        output, about.get("created", ""), _created_rig_time_ns(about), about.get("clock")
+    )
     for name, data in contents.attachments.items():
         try:
             writer.attach(name, json.loads(data), 0)
@@ -304,7 +328,7 @@ def _entries_of(
     topics, parser = dict(contents.topics), EntryParser()
     with closing(open_recording(path)) as file:
         for place in contents.chunks:
-            # Where no summary lists the channels, the chunks do, and every one must be read.
+            # As long as the channels are unknown, every chunk must be read: they declare them.
             if contents.topics and place.end_ns < from_ns:
                 continue
             try:
@@ -316,5 +340,21 @@ def _entries_of(
             except DataError as error:
                 if leave_out_damaged:
                     continue
-                raise DataError(f"{path}: {error}") from error
+                raise _damaged(path, place, error) from error
             yield from (entry for entry in entries if entry is not None)
+
+
+def _sets_of(path: Path, contents: Contents) -> Iterator[RecordedSet]:
+    topics, parser = dict(contents.topics), EntryParser()
+    with closing(open_recording(path)) as file:
+        for place in contents.chunks:
+            try:
+                found = [parser.parse(SETS, data) for data in topic_messages(file, place, SETS, topics, path)]
+            except DataError as error:
+                raise _damaged(path, place, error) from error
+            yield from (entry for entry in found if isinstance(entry, RecordedSet))
+    contents.topics |= topics
+
+
+def _damaged(path: Path, place: ChunkPlace, error: DataError) -> DataError:
+    return DataError(f"{path}, at byte {place.offset}: {error}")

@@ -50,7 +50,7 @@ class RingDrawing:
         keys = ("radius", "yaw_step_deg", "tolerance_deg", "tolerance_m")
         try:
             numbers = {names.get(key, key): float(values[key]) for key in keys if key in values}
-        except (TypeError, ValueError) as error:
+        except (TypeError, ValueError, OverflowError) as error:
             raise DataError(f"ring must hold numbers: {error}") from error
         drawing = cls(**numbers)
         if not (drawing.tolerance_deg > 0 and drawing.tolerance_m > 0 and drawing.radius_m >= 0):
@@ -262,7 +262,7 @@ def _camera_entry(item: Any, raw_model: RawDepthModel | None) -> CameraEntry:
         camera_id = int(item["id"])
         name = str(item.get("name") or f"cam{camera_id:02d}")
         T = item.get("T_rig_cam")
-    except (AttributeError, KeyError, TypeError, ValueError) as error:
+    except (AttributeError, KeyError, TypeError, ValueError, OverflowError) as error:
         raise DataError(f"a camera needs an integer `id`: {error!r}") from error
     if Path(name).name != name or name in ("", ".", ".."):
         raise DataError(f"camera {camera_id}: name {name!r} must be a plain folder name")
