@@ -53,6 +53,7 @@ bench-calibration: $(BENCH)  ## the calibration against its bars, the bound and 
 
 bench-fusion: $(READY) build/open3d  ## the live fusion against its bars and Open3D, into docs/performance.md
 	$(BIN)/python tests/benchmarks/bench_fusion.py
+	$(BIN)/python tests/benchmarks/bench_recording.py
 	$(BIN)/python tests/benchmarks/offline_scaling.py
 
 # In a folder of its own: it brings a pytest plugin that the tests' settings refuse. Without it the bench skips it.
