@@ -159,15 +159,17 @@ def _wait_for_bytes(take: Path, size: float) -> None:
 def report(results: dict[str, Any]) -> str:
     """The section of docs/performance.md."""
     same = "the same" if results["replay_identical"] else "**not** the same"
+    command = "`python tests/benchmarks/bench_recording.py`"
     return f"""## Recording
 
-`python tests/benchmarks/bench_recording.py` on {machine("mcap")}; load {results["load_before"]:.1f} before. Encoded frames
-of real Kinect images, twelve cameras at 30 frames a second over loopback UDP, `rig-server --record` in a process of its own.
+{command} on {machine("mcap")}; load {results["load_before"]:.1f} before.
+Encoded frames of real Kinect images, twelve cameras at 30 frames a second over loopback UDP,
+`rig-server --record` in a process of its own.
 
 {results["seconds"]:.0f} s: {results["sent"]} frames sent, {results["recorded"]} in the file,
 **{results["record_dropped"]} dropped by the recorder**, {results["network_lost"]} lost by the network;
-{results["wrong"]} payloads differ from those sent; {results["mb_s"]:.1f} MB/s. A plain writer fills this disk with
-{results["disk_mb_s"]:.0f} MB/s.
+{results["wrong"]} payloads differ from those sent; {results["mb_s"]:.1f} MB/s.
+A plain writer fills this disk with {results["disk_mb_s"]:.0f} MB/s.
 
 Killed with signal 9 in the middle of a take: the file lacks the last **{results["kill_lost_s"]:.2f} s**. Its
 {results["torn_sets"]} sets are {same}, bit for bit, before and after `rig-server recover`."""
