@@ -154,6 +154,12 @@ def export(
     from rig_calib.frame_exports.formats import FORMATS
     from rig_protocol.errors import ConfigurationError
 
+    if form not in (*CALIBRATION_FORMATS, *FORMATS):
+        known = ", ".join((*CALIBRATION_FORMATS, *FORMATS))
+        raise ConfigurationError(f"format {form!r} is none of {known}")
+    if (form in FORMATS) == (source.suffix == ".json"):
+        wanted = "frames: a rig folder, or a recording FILE.mcap" if form in FORMATS else "a calibration.json"
+        raise ConfigurationError(f"{source}: format {form} is of {wanted}")
     console = Console(highlight=False, soft_wrap=True)
     if form in FORMATS:
         _export_frames(
@@ -167,11 +173,8 @@ def export(
             workers,
             scheduler,
         )
-    elif form in CALIBRATION_FORMATS:
-        _export_calibration(console, form, source, out, rig, frames or 1)
     else:
-        known = ", ".join((*CALIBRATION_FORMATS, *FORMATS))
-        raise ConfigurationError(f"format {form!r} is none of {known}")
+        _export_calibration(console, form, source, out, rig, frames or 1)
 
 
 def _export_calibration(
