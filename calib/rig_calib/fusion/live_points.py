@@ -38,8 +38,8 @@ _FULL = F32(255.0)
 _FORWARD, _BACKWARD = np.uint64(1), np.uint64(2**64 - 1)  # steps along a row, modulo 2^64
 _PITCH = np.uint64(PITCH)
 
-# Further rows of `Scratch.rows`: distance from the cylinder's axis, column and row of the panorama; after them,
-# in the same place, colour columns in the direction of the scan, and the greatest so far.
+# Further rows of `Scratch.rows`: distance from the cylinder's axis, column and row of the panorama; later, in
+# the same place, colour columns in the direction of the scan, and the greatest so far.
 _DISTANCE, _COLUMN, _ROW = (np.uint64(k * PITCH + MARGIN) for k in range(12, 15))
 _ALONG, _OF_FOUR, _OF_SIXTEEN = (np.uint64(k * PITCH + MARGIN) for k in range(12, 15))
 # Rows of `Scratch.places`: a cell of the window and 2×2 pixels of the colour image, −1 for none; distance in
