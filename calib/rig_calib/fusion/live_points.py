@@ -38,7 +38,9 @@ _FULL = F32(255.0)
 _FORWARD, _BACKWARD = np.uint64(1), np.uint64(2**64 - 1)  # steps along a row, modulo 2^64
 _PITCH = np.uint64(PITCH)
 
-# Further rows of `Scratch.rows`: colour columns in the direction of the scan, and the greatest so far.
+# Further rows of `Scratch.rows`: distance from the cylinder's axis, column and row of the panorama; later, in
+# the same place, colour columns in the direction of the scan, and the greatest so far.
+_DISTANCE, _COLUMN, _ROW = (np.uint64(k * PITCH + MARGIN) for k in range(12, 15))
 _ALONG, _OF_FOUR, _OF_SIXTEEN = (np.uint64(k * PITCH + MARGIN) for k in range(12, 15))
 # Rows of `Scratch.places`: a cell of the window and 2×2 pixels of the colour image, −1 for none; distance in
 # units; weight, as a byte.
@@ -123,6 +125,7 @@ def place_points(
     for y in range(height):
         _place_row(camera, y, measured[camera, y], ring, rows)
         merge_row(camera, y, measured, ring, rows, places)
+        _project_row(width, drum, rows)
         _draw_row(camera, width, drum, rows, places)
         _color_row(width, size, kind, rows, places)
         if scan > 0:
@@ -183,45 +186,56 @@ def _table_row(planes: Array32, tables: I16, k: int, y: int) -> tuple[F32, F32, 
 
 
 @inlined
-def _draw_row(camera: int, width: np.uint64, drum: Drum, rows: Array32, places: I32) -> None:
-    """Each point's cell of the window, its distance from the cylinder's axis, and its weight."""
+def _project_row(width: np.uint64, drum: Drum, rows: Array32) -> None:
+    """Each point's distance from the cylinder's axis, and its column and row there, to be cut to integers."""
     T = drum.T_view_rig
     t00, t01, t02, t03 = T[0, 0], T[0, 1], T[0, 2], T[0, 3]
     t10, t11, t12, t13 = T[1, 0], T[1, 1], T[1, 2], T[1, 3]
     t20, t21, t22, t23 = T[2, 0], T[2, 1], T[2, 2], T[2, 3]
-    columns, lines = np.int32(drum.cells.shape[1]), np.int32(drum.cells.shape[2])
-    start, circle, bottom = np.int32(drum.starts[camera]), np.int32(drum.circle), F32(drum.cells.shape[2])
     scale, left, top = drum.pixels_per_rad, drum.azimuth_left + HALF / drum.pixels_per_rad, drum.slope_top
     for i in range(width):
         px, py, pz = rows[X + i], rows[Y + i], rows[Z + i]
         x = t00 * px + t01 * py + t02 * pz + t03
         y = t10 * px + t11 * py + t12 * pz + t13
         z = t20 * px + t21 * py + t22 * pz + t23
-        square = max(x * x + y * y, F32(1e-12))
-        distance = F32(np.sqrt(square))
+        distance = F32(np.sqrt(max(x * x + y * y, F32(1e-12))))
         turned = left - _azimuth(x, y)
         turned -= _TURN * F32(np.floor(turned / _TURN))
-        column = np.int32(turned * scale) - start
+        rows[_DISTANCE + i] = distance
+        rows[_COLUMN + i] = turned * scale
+        rows[_ROW + i] = (top - z / distance) * scale + HALF
+
+
+@inlined
+def _draw_row(camera: int, width: np.uint64, drum: Drum, rows: Array32, places: I32) -> None:
+    """Each point's cell of the window, its distance in units, and its weight as a byte."""
+    columns, lines = np.int32(drum.cells.shape[1]), np.int32(drum.cells.shape[2])
+    start, circle, bottom = np.int32(drum.starts[camera]), np.int32(drum.circle), F32(drum.cells.shape[2])
+    for i in range(width):
+        column = np.int32(rows[_COLUMN + i]) - start
         column = column + circle if column < np.int32(0) else column
-        at = (top - z / distance) * scale + HALF
-        row = np.int32(min(max(at, -ONE), bottom))
-        drawn = (column < columns) & (row < lines) & (at >= ZERO)
+        row = np.int32(min(max(rows[_ROW + i], -ONE), bottom))
+        drawn = (column < columns) & (row < lines) & (rows[_ROW + i] >= ZERO)
         places[_CELL + i] = column * lines + row if drawn else np.int32(-1)
-        # The fourth power undoes q⁴: both cameras of a seam are equally far.
-        places[_PART + i] = np.int32(min(max(rows[WEIGHT + i] * square * square * _SHARE, ONE), _FULL))
-        places[_UNITS + i] = np.int32(min(distance, F32(1e4)) * UNITS_A_METRE)
+        square = (
+            rows[_DISTANCE + i] * rows[_DISTANCE + i]
+        )  # undoes q⁴: both cameras of a seam are equally far
+        part = rows[WEIGHT + i] * square * square * _SHARE
+        places[_PART + i] = np.int32(min(max(part, ONE), _FULL))
+        places[_UNITS + i] = np.int32(min(rows[_DISTANCE + i], F32(1e4)) * UNITS_A_METRE)
 
 
 @inlined
 def _azimuth(x: F32, y: F32) -> F32:
     """atan2(y, x) to 2e-5 rad without a branch (Abramowitz & Stegun 4.4.49)."""
     ax, ay = abs(x), abs(y)
-    a = min(ax, ay) / max(max(ax, ay), F32(1e-9))
+    steep = ay > ax
+    a = (ax if steep else ay) / max(ay if steep else ax, F32(1e-9))
     s = a * a
     series = F32(-0.3302995) + s * (F32(0.1801410) + s * (F32(-0.0851330) + s * F32(0.0208351)))
     angle = a * (F32(0.9998660) + s * series)
-    angle = _HALF_PI - angle if ay > ax else angle
-    angle = _PI - angle if x < ZERO else angle
+    angle = (_HALF_PI if steep else ZERO) + (-angle if steep else angle)
+    angle = (_PI if x < ZERO else ZERO) + (-angle if x < ZERO else angle)
     return -angle if y < ZERO else angle
 
 
