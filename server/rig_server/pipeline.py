@@ -10,6 +10,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
+from rig_calib.rig_calibration import RigCalibration
 from rig_protocol.codecs import COLOR_CODECS, DEPTH_CODECS
 from rig_protocol.errors import RigError
 from rig_protocol.events import (
@@ -64,6 +65,7 @@ class LivePipeline:
 
     def __init__(self, settings: RigSettings, key: RigKey, record: Path | None = None) -> None:
         """`record`: the file to record to."""
+        self.calibration: RigCalibration | None = None
         self._settings = settings
         self._durations = Durations()
         self._assembler = Assembler(_synchroniser(settings), self._durations.set_delivered)
@@ -256,7 +258,7 @@ class LivePipeline:
 
     def _documents(self) -> Mapping[str, Any]:
         """What a recording tells of the rig, as it is now."""
-        return take_documents(self._settings, self.description, self.hellos)
+        return take_documents(self._settings, self.description, self.hellos, self.calibration)
 
     def _camera_counts(self) -> Mapping[str, Mapping[str, int]]:
         """What came of every camera, and what was lost on the way."""

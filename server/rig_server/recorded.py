@@ -4,6 +4,7 @@ from collections import deque
 from collections.abc import Collection, Mapping
 from pathlib import Path
 
+from rig_calib.rig_calibration import RigCalibration
 from rig_protocol.errors import ConfigurationError, RigError
 from rig_protocol.events import ControlAnswered
 from rig_protocol.frames import PanoramicFrame
@@ -23,6 +24,7 @@ class RecordedRig:
         if not folder.is_dir():
             raise ConfigurationError(f"{folder} is no folder: a rig folder holds nominal.json and cam00, ...")
         self._folder = folder
+        self.calibration: RigCalibration | None = None
         self.description: RigDescription = read_rig_description(folder)
         self._indices = {
             camera.id: frozenset(frame_indices(folder, camera.name)) for camera in self.description.cameras

@@ -25,7 +25,7 @@ from rig_server.config import RigSettings
 from rig_server.metrics import CameraMetrics, RateMeter, RigStatus
 from rig_server.receiver import rig_time_ns
 from rig_server.synchroniser import Synchroniser
-from rig_server.take_documents import recorded_hellos
+from rig_server.take_documents import recorded_calibration, recorded_hellos
 
 logger = logging.getLogger(__name__)
 
@@ -54,6 +54,7 @@ class ReplayedRig:
         self._recording, self._settings, self._options = Recording(take), settings, options
         self.description: RigDescription = self._recording.description
         self.hellos: dict[int, Hello] = recorded_hellos(self._recording.document(HELLOS), self.description)
+        self.calibration = recorded_calibration(self._recording)
         self._has_sets = self._recording.has_sets
         span_s = (self._recording.end_ns - self._recording.start_ns) / 1e9
         if options.seek_s > span_s:

@@ -2,6 +2,7 @@
 
 import re
 import secrets
+import threading
 import time
 from collections.abc import Callable, Collection, Iterator, Mapping
 from dataclasses import replace
@@ -60,6 +61,9 @@ class Feed(Protocol):
         """True when no panoramic frame will come any more."""
         ...
 
+    calibration: RigCalibration | None
+    """The one in force: at first that of a recorded take; others put another one. A recording embeds it."""
+
     def start(self) -> None:
         """Begin."""
         ...
@@ -109,7 +113,11 @@ class Rig:
         self.settings = settings
         self._feed = feed
         self._simulation = simulation
-        self._watch = _watch(settings)
+        self._swapping = threading.Lock()  # one thread at a time begins, swaps or ends the drift watch
+        self._running = False
+        self._watch: WatchSink | None = None
+        if settings.watch.calibration is not None:
+            self.put_in_force(_watched_calibration(settings.watch.calibration), watch=True)
 
     @classmethod
     def open(cls, source: str | Path, settings: RigSettings | None = None) -> Self:
@@ -166,8 +174,10 @@ class Rig:
         try:
             if self._simulation is not None:
                 self._simulation.start()
-            if self._watch is not None:
-                self._watch.start()
+            with self._swapping:
+                self._running = True
+                if self._watch is not None:
+                    self._watch.start()
             self._feed.start()
         except BaseException:
             self.close()
@@ -192,8 +202,10 @@ class Rig:
         try:
             self._feed.stop()  # first: agents that we end ourselves are no news
         finally:  # also when somebody loses patience and presses Ctrl-C again
-            if self._watch is not None:
-                self._watch.stop()
+            with self._swapping:
+                self._running = False
+                if self._watch is not None:
+                    self._watch.stop()
             if self._simulation is not None:
                 self._simulation.close()
 
@@ -202,8 +214,9 @@ class Rig:
         if self._simulation is not None:
             self._simulation.check()
         panorama = self._feed.next_panorama(timeout_s)
-        if panorama is not None and self._watch is not None:
-            self._watch.offer(panorama, lambda: self.description)
+        watch = self._watch  # others swap it
+        if panorama is not None and watch is not None:
+            watch.offer(panorama, lambda: self.description)
         return panorama
 
     def wait_for_cameras(
@@ -250,6 +263,28 @@ class Rig:
         return self._feed.stop_recording()
 
     @property
+    def calibration(self) -> RigCalibration | None:
+        """The one in force: that which is watched over, that of a replayed take, or the one put in force."""
+        return self._feed.calibration
+
+    def put_in_force(self, calibration: RigCalibration, watch: bool = False) -> None:
+        """Go by this calibration from now on; any thread may say so.
+
+        A recording that runs embeds it. Where a drift watch runs, or `watch` asks for one, it begins anew
+        with this calibration, and this returns when the one before has ended its look.
+        """
+        with self._swapping:
+            before = self._watch
+            if watch or before is not None:
+                fresh = WatchSink(calibration, self.settings.watch.every)
+                if self._running:
+                    fresh.start()
+                self._watch = fresh
+            self._feed.calibration = calibration
+        if before is not None:
+            before.stop()
+
+    @property
     def description(self) -> RigDescription:
         """The cameras that have come so far, their models, and nominal poses where the drawing is known."""
         return self._feed.description
@@ -276,21 +311,18 @@ class Rig:
 
     def status(self) -> RigStatus:
         """Rates and losses of every camera, and of the sets."""
-        status = self._feed.status()
-        return status if self._watch is None else replace(status, drift=self._watch.report())
+        status, watch = self._feed.status(), self._watch
+        return status if watch is None else replace(status, drift=watch.report())
 
     def true_poses(self) -> Mapping[int, Pose] | None:
         """True T_rig_camera by camera id; None where nobody knows them."""
         return None if self._simulation is None else self._simulation.true_poses()
 
 
-def _watch(settings: RigSettings) -> WatchSink | None:
-    """The drift watch, where settings ask for it; ConfigurationError when its calibration cannot be read."""
-    file = settings.watch.calibration
-    if file is None:
-        return None
+def _watched_calibration(file: Path) -> RigCalibration:
+    """The calibration that settings ask to watch over; ConfigurationError when it cannot be read."""
     try:
-        return WatchSink(RigCalibration.load(file), settings.watch.every)
+        return RigCalibration.load(file)
     except DataError as error:
         raise ConfigurationError(f"watch.calibration: {error}") from error
 

@@ -1,30 +1,52 @@
 """What a recording tells of its rig beside frames: cameras, agents, settings, calibration; and back."""
 
+import functools
+import logging
 from collections.abc import Mapping
 from typing import Any
 
+from rig_calib.rig_calibration import RigCalibration
 from rig_protocol.errors import DataError
 from rig_protocol.message_fields import codec_ids, integer, number, optional, text
 from rig_protocol.messages import Hello
-from rig_protocol.recording import CALIBRATION, DESCRIPTION, HELLOS, SETTINGS
-from rig_protocol.rig_folder import RigDescription, read_json
+from rig_protocol.recording import CALIBRATION, DESCRIPTION, HELLOS, SETTINGS, Recording
+from rig_protocol.rig_folder import RigDescription
 from rig_server.config import MAX_CAMERAS, RigSettings
+
+logger = logging.getLogger(__name__)
 
 _MAX_TEXT = 64  # bytes, as in a hello
 _MAX_CODECS = 16
 
 
 def take_documents(
-    settings: RigSettings, description: RigDescription, hellos: Mapping[int, Hello]
+    settings: RigSettings,
+    description: RigDescription,
+    hellos: Mapping[int, Hello],
+    calibration: RigCalibration | None,
 ) -> dict[str, Any]:
-    """The documents by their name in the recording; none of the cameras before the first has come."""
+    """The documents by their name in the recording; none of the cameras before the first has come.
+
+    `calibration`: the one in force.
+    """
     documents: dict[str, Any] = {SETTINGS: settings.model_dump(mode="json", exclude={"key_file"})}
     if hellos:
         documents[DESCRIPTION] = description.to_dict()
         documents[HELLOS] = {"agents": [_told(i, hello) for i, hello in sorted(hellos.items())]}
-    if settings.watch.calibration is not None:
-        documents[CALIBRATION] = read_json(settings.watch.calibration)
+    if calibration is not None:
+        documents[CALIBRATION] = _calibration_document(calibration)
     return documents
+
+
+def recorded_calibration(recording: Recording) -> RigCalibration | None:
+    """The calibration of a recording; None where there is none, or none that this release can read."""
+    if CALIBRATION not in recording.attachments:
+        return None
+    try:
+        return RigCalibration.from_dict(recording.document(CALIBRATION))
+    except DataError as error:  # the images are worth playing all the same
+        logger.warning("the recording's %s is left out: %s", CALIBRATION, error)
+        return None
 
 
 def recorded_hellos(document: Any, description: RigDescription) -> dict[int, Hello]:
@@ -34,6 +56,12 @@ def recorded_hellos(document: Any, description: RigDescription) -> dict[int, Hel
         raise DataError(f"{HELLOS} must hold a list `agents`")
     hellos = (_hello(agent, description) for agent in agents[:MAX_CAMERAS])
     return {hello.camera_id: hello for hello in hellos if hello.camera_id is not None}
+
+
+@functools.lru_cache(maxsize=1)
+def _calibration_document(calibration: RigCalibration) -> dict[str, Any]:
+    """The same object for the same calibration: a recording asks twice a second what is new."""
+    return calibration.to_dict()
 
 
 def _told(camera_id: int, hello: Hello) -> dict[str, Any]:
