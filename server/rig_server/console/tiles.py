@@ -9,6 +9,8 @@ from rig_server.console.camera_pictures import Mode, color_picture, depth_pictur
 from rig_server.console.picture_guide import PictureGuide
 from rig_server.console.upright import felt_turns, turned
 
+_LONGEST_WAY_NS = 10_000_000_000
+
 
 @dataclass(frozen=True, slots=True)
 class Look:
@@ -20,12 +22,11 @@ class Look:
 
 @dataclass(frozen=True, slots=True)
 class Tile:
-    """One camera's picture. `received_ns`, rig time, is when its last datagram was here, else its exposure."""
+    """One camera's picture. `received_ns`: rig time at which its last datagram was here."""
 
     camera_id: int
     width: int
     height: int
-    timestamp_ns: int
     received_ns: int
     data: bytes
 
@@ -44,8 +45,13 @@ class TileRound:
         return [self.tiles[key] for key in keys if key in self.tiles]
 
 
-def tile_round(panorama: PanoramicFrame, guide: PictureGuide, looks: Collection[Look]) -> TileRound:
-    """Every tile that any of the looks wants; a camera without frame, or without that image, has none."""
+def tile_round(
+    panorama: PanoramicFrame, offered_ns: int, guide: PictureGuide, looks: Collection[Look]
+) -> TileRound:
+    """Every tile that any of the looks wants; a camera without frame, or without that image, has none.
+
+    `offered_ns`: rig time at which the set was there.
+    """
     tiles = {}
     for camera_id, frame in panorama.frames.items():
         if frame is None:
@@ -54,11 +60,9 @@ def tile_round(panorama: PanoramicFrame, guide: PictureGuide, looks: Collection[
             image = camera_picture(frame, guide, mode, full)
             if image is None:
                 continue
-            received_ns = frame.timestamp_ns if frame.received_ns is None else frame.received_ns
+            received_ns = _received_ns(frame, offered_ns)
             height, width = image.shape[:2]
-            tiles[mode, camera_id, full] = Tile(
-                camera_id, width, height, frame.timestamp_ns, received_ns, jpeg(image)
-            )
+            tiles[mode, camera_id, full] = Tile(camera_id, width, height, received_ns, jpeg(image))
     return TileRound(panorama.index, tiles)
 
 
@@ -74,3 +78,11 @@ def camera_picture(frame: RgbdFrame, guide: PictureGuide, mode: Mode, full: bool
         image = guide.tints[frame.camera_id].over(image)
     turns = guide.turns.get(frame.camera_id, 0) if frame.gravity is None else felt_turns(frame.gravity)
     return turned(image, turns)
+
+
+def _received_ns(frame: RgbdFrame, offered_ns: int) -> int:
+    """Those of a folder crossed no network, those of a recording another day."""
+    received_ns = frame.received_ns
+    if received_ns is None or not 0 <= offered_ns - received_ns < _LONGEST_WAY_NS:
+        return offered_ns
+    return received_ns

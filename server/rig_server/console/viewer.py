@@ -6,7 +6,7 @@ import struct
 from collections.abc import Sequence
 from typing import Any
 
-from aiohttp import web
+from aiohttp import WSCloseCode, web
 
 from rig_server.console.tiles import Look, Tile, TileRound
 
@@ -55,6 +55,10 @@ class Viewer:
     def painted(self, number: Any) -> tuple[int, ...]:
         """The page has painted a message; when the datagrams of its tiles had come, in rig time."""
         return self._unpainted.pop(number, ()) if isinstance(number, int) else ()
+
+    async def close(self) -> None:
+        """The server ends."""
+        await self._socket.close(code=WSCloseCode.GOING_AWAY)
 
     async def send_on(self) -> None:
         """Send what there is, until the socket closes."""

@@ -89,7 +89,9 @@ class FuseSink:
     def _follow(self, calibration: RigCalibration, panorama: PanoramicFrame) -> None:
         """Make the fusion anew when what it stands on has changed; its tables take half a second."""
         made_of = (calibration, _depth_frame(panorama) or self._settings.depth_frame)
-        same = self._made_of is not None and self._made_of[0] is calibration and self._made_of[1:] == made_of[1:]
+        same = (
+            self._made_of is not None and self._made_of[0] is calibration and self._made_of[1:] == made_of[1:]
+        )
         models = self._newest_models()
         if same and _alike(models, self._models):
             return

@@ -1,0 +1,78 @@
+// One camera, enlarged: its full picture, its figures, and what it can be told.
+
+import { paint } from "./live.js";
+import { told } from "./health.js";
+import { onPress, order } from "./orders.js";
+import { isGone } from "./tiles.js";
+import { awaySince, byId, element } from "./words.js";
+
+const FACTS = ["fps", "loss", "temperature_c", "clock_error_us", "drift_mm", "drift_deg"];
+const TITLES = ["frames/s", "lost now", "temperature", "clock", "moved", "turned"];
+
+export class Detail {
+  id = null;
+  #state = null;
+  #changed;
+  #dialog = byId("detail");
+
+  constructor(changed) {
+    this.#changed = changed;
+    onPress("identify", () => order("identify", { camera: this.id }));
+    onPress("expose-auto", () => order("expose", { camera: this.id, auto: true }));
+    onPress("expose-fixed", () => order("expose", { camera: this.id, auto: false }));
+    onPress("calibrate-one", () => order("start-calibration", { camera: String(this.id) }));
+    byId("detail-before").addEventListener("click", () => this.step(-1));
+    byId("detail-after").addEventListener("click", () => this.step(1));
+    this.#dialog.querySelector(".close").addEventListener("click", () => this.#dialog.close());
+    this.#dialog.addEventListener("click", (event) => event.target === this.#dialog && this.#dialog.close());
+    this.#dialog.addEventListener("close", () => {
+      this.id = null;
+      this.#changed();
+    });
+  }
+
+  open(id) {
+    this.id = id;
+    if (!this.#dialog.open) this.#dialog.showModal();
+    this.#changed();
+    if (this.#state) this.show(this.#state);
+  }
+
+  step(by) {
+    const ids = this.#state?.cameras.map((camera) => camera.id) ?? [];
+    const at = ids.indexOf(this.id);
+    if (at >= 0) this.open(ids[(at + by + ids.length) % ids.length]);
+  }
+
+  paint(id, bitmap) {
+    if (id === this.id) paint(byId("detail-canvas"), bitmap);
+  }
+
+  show(state) {
+    this.#state = state;
+    const camera = state.cameras.find((one) => one.id === this.id);
+    if (!camera) return;
+    byId("detail-title").textContent = camera.name;
+    byId("detail-canvas").setAttribute("aria-label", `${camera.name}, live`);
+    const gone = isGone(camera);
+    byId("detail-away").hidden = !gone;
+    byId("detail-away").textContent = gone ? awaySince(camera.away_s) : "";
+    const facts = FACTS.map((name, k) => [TITLES[k], told(name, state.health[name]?.[camera.id])]);
+    facts.push(["frames", String(camera.frames)], ["lost", String(camera.lost)]);
+    facts.push(["damaged", String(camera.damaged)], ["resent fragments", String(camera.resent)]);
+    if (camera.serial) facts.push(["serial", camera.serial]);
+    if (camera.port_path) facts.push(["USB port", camera.port_path]);
+    facts.push(["in the calibration", camera.placed ? "yes" : "no"]);
+    if (camera.moved) facts.push(["alarm", camera.moved]);
+    byId("detail-facts").replaceChildren(
+      ...facts.map(([title, value]) => {
+        const pair = element("div");
+        pair.append(element("dt", title), element("dd", value));
+        return pair;
+      }),
+    );
+    for (const id of ["identify", "expose-auto", "expose-fixed", "calibrate-one"]) {
+      byId(id).hidden = !state.orders || (id === "calibrate-one" && !state.calibration);
+    }
+  }
+}
