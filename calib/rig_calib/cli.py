@@ -130,17 +130,21 @@ def evaluate(
 @app.command()
 def fuse(
     folder: Folder,
-    calibration: Annotated[Path, typer.Option(help="The calibration.json of this rig.")],
     out: Out,
+    calibration: Annotated[
+        Path | None,
+        typer.Option(help="The calibration.json of this rig; else the one that a recording brings."),
+    ] = None,
     frames: Frames = None,
 ) -> None:
     """Fuse a rig folder or a recording with a calibration into cloud.ply and panorama.png."""
     from rich.console import Console
 
     from rig_calib.outputs import make_output_folder, write_fused
+    from rig_calib.recorded_calibration import calibration_for
     from rig_calib.rig_folder_calibration import read_description, read_views
 
-    known = _load(calibration)
+    known = calibration_for(folder, calibration)
     views = read_views(folder, read_description(folder), frames)
     make_output_folder(out)
     fused = write_fused(out, known, views)

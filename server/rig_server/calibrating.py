@@ -15,25 +15,39 @@ from rig_protocol.poses import Pose
 from rig_protocol.rig_folder import write_true_poses
 from rig_protocol.troubleshooting import Topic
 from rig_server.calibration_task import CalibrationTask, Estimate
-from rig_server.coach_display import CoachDisplay, counted
+from rig_server.capture_log import CaptureLog
+from rig_server.coach import Coach, Coaches, counted
+from rig_server.coach_display import CoachDisplay
 from rig_server.coached_capture import coached_capture
 from rig_server.rig import Rig
 
 
-def calibrate_rig(rig: Rig, folder: Path, console: Console, task: CalibrationTask | None = None) -> None:
+def calibrate_rig(
+    rig: Rig,
+    folder: Path,
+    console: Console,
+    task: CalibrationTask | None = None,
+    log: CaptureLog | None = None,
+) -> None:
     """Wait for the cameras, collect, calibrate, write the files, print the tables.
 
     RigError when cameras do not come, when the result fails its gate, and when it misses the task's target
-    (the files are written in the last two cases, too). The default task is the whole rig.
+    (the files are written in the last two cases, too). The default task is the whole rig; `log`: for whoever
+    looks on. A recording embeds a result that passes its gate.
     """
     task = task or CalibrationTask.whole_rig(rig.settings)
     started_s = time.monotonic()
     with CoachDisplay(console) as display, rig:
-        _wait_for_cameras(rig, display)
+        coach = display if log is None else Coaches(display, log)
+        _wait_for_cameras(rig, coach)
         truth = rig.true_poses()
-        estimate = coached_capture(rig, task, display)
-    calibrated_s = time.monotonic()
-    calibration = task.stamped(estimate, rig.hellos, rig.source)
+        estimate = coached_capture(rig, task, coach)
+        calibrated_s = time.monotonic()
+        calibration = task.stamped(estimate, rig.hellos, rig.source)
+        if not calibration.failures:
+            rig.put_in_force(calibration)
+    if log is not None:
+        log.ready()
     if task.known is not None:
         keep_before(folder)
     with progress_bar(console) as tell:
@@ -51,13 +65,13 @@ def calibrate_rig(rig: Rig, folder: Path, console: Console, task: CalibrationTas
     _judge(task, estimate, console)
 
 
-def _wait_for_cameras(rig: Rig, display: CoachDisplay) -> None:
+def _wait_for_cameras(rig: Rig, coach: Coach) -> None:
     expected = rig.settings.expected_cameras or len(rig.settings.cameras) or None
     rig.wait_for_cameras(
-        rig.settings.capture.wait_s, lambda status: display.connected(status.connected, expected)
+        rig.settings.capture.wait_s, lambda status: coach.connected(status.connected, expected)
     )
     connected = rig.status().connected
-    display.connected(connected, connected)
+    coach.connected(connected, connected)
 
 
 def _judge(task: CalibrationTask, estimate: Estimate, console: Console) -> None:

@@ -48,6 +48,13 @@ class CalibrationTask:
     camera_id: int | None = None
     coached: bool = False
 
+    def __post_init__(self) -> None:
+        """ConfigurationError where sets would repeat frames."""
+        if self.settings.synchroniser.policy == "latest":
+            raise ConfigurationError(
+                'synchroniser.policy = "latest" repeats frames, which a calibration must not: use "partial"'
+            )
+
     @classmethod
     def whole_rig(cls, settings: RigSettings, coached: bool = False) -> "CalibrationTask":
         """Calibrate the whole rig; ConfigurationError for a target that the method cannot judge."""

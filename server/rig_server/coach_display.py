@@ -1,7 +1,6 @@
 """The coach in the terminal: every overlap, how well it is known so far, and what to do; else plain lines."""
 
 import time
-from collections.abc import Sequence
 
 from rich import box
 from rich.bar import Bar
@@ -12,8 +11,9 @@ from rich.table import Table
 from rich.text import Text
 
 from rig_calib.accuracy import Accuracy
-from rig_calib.coaching import PairSupport, Support
+from rig_calib.coaching import Support
 from rig_server.calibration_task import Estimate
+from rig_server.coach import coach_lines, counted, headline
 from rig_server.live_panel import LivePanel
 
 _LINES_EVERY_S = 5.0
@@ -45,7 +45,7 @@ class CoachDisplay(LivePanel):
         """So many complete sets have come."""
         self._bars["collected"] = (f"{sets}/{wanted} complete sets", sets / wanted)
 
-    def begun(self, sets: int) -> None:
+    def begun(self, sets: int, last: bool) -> None:  # noqa: ARG002  # as every coach has it
         """A calibration on so many sets begins."""
         self._begun = sets
 
@@ -90,29 +90,6 @@ def coach_table(estimate: Estimate) -> RenderableType:
     advice = (Text(str(pair), _STYLES[pair.support]) for pair in estimate.pairs if pair.advice)
     missed = [Text(f"target: {estimate.missed}", "yellow")] if estimate.missed else []
     return Group(table, *advice, *missed)
-
-
-def coach_lines(estimate: Estimate) -> list[str]:
-    """The same for a log: how many overlaps are good, and those that are not."""
-    lines = [headline(estimate.sets, estimate.pairs)]
-    lines += [str(pair) for pair in estimate.pairs if pair.advice]
-    return lines + ([f"target: {estimate.missed}"] if estimate.missed else [])
-
-
-def headline(sets: int, pairs: Sequence[PairSupport]) -> str:
-    """How the overlaps are, in one line."""
-    good = sum(pair.support is Support.GOOD for pair in pairs)
-    told = f"on {counted(sets, 'set')}: {good} of {counted(len(pairs), 'overlap')} good"
-    known = [pair.expected for pair in pairs if pair.expected is not None]
-    if not known:
-        return told
-    worst = Accuracy(max(one.deg for one in known), max(one.mm for one in known))
-    return f"{told}, neighbours expected to be known to {worst} or better"
-
-
-def counted(count: int, noun: str) -> str:
-    """1 set, 2 sets."""
-    return f"{count} {noun}" + "s" * (count != 1)
 
 
 def _figures(expected: Accuracy | None) -> tuple[str, str]:

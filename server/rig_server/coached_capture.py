@@ -1,5 +1,6 @@
 """Panoramic frames collected while a background thread calibrates on those that are in."""
 
+import threading
 import time
 from collections import deque
 from functools import partial
@@ -7,23 +8,29 @@ from functools import partial
 from rig_protocol.frames import PanoramicFrame
 from rig_server.background_work import BackgroundWork
 from rig_server.calibration_task import CalibrationTask, Estimate
-from rig_server.coach_display import CoachDisplay
-from rig_server.grouped_sets import SetSource, sets_of
-from rig_server.rig import Rig
+from rig_server.coach import Coach
+from rig_server.grouped_sets import GroupableRig, SetSource, sets_of
 from rig_server.sinks.calibrate import CalibrateSink
 
 _POLL_S = 0.25
 
 
-def coached_capture(rig: Rig, task: CalibrationTask, display: CoachDisplay) -> Estimate:
+class CaptureCancelledError(Exception):
+    """Somebody wants no result any more."""
+
+
+def coached_capture(
+    rig: GroupableRig, task: CalibrationTask, coach: Coach, cancelled: threading.Event | None = None
+) -> Estimate:
     """Collect sets and calibrate on them; a coached task goes on with fresh sets until it is content.
 
-    Closes the rig as soon as it needs no more sets. RigError when no frame comes, or when the calibration's
-    input is unusable.
+    Ends the rig's sets as soon as it needs no more. RigError when no frame comes, or when the calibration's
+    input is unusable; CaptureCancelledError soon after `cancelled` is set.
     """
+    cancelled = cancelled or threading.Event()
     with BackgroundWork[Estimate]("calibration") as work, sets_of(rig, task.settings.capture) as sets:
         while True:
-            estimate = _Round(sets, task, display, work).run()
+            estimate = _Round(sets, task, coach, work, cancelled).run()
             if not task.coached or task.contents(estimate):
                 return estimate
             _skip_waiting_sets(rig)
@@ -40,10 +47,16 @@ class _Round:
     """
 
     def __init__(
-        self, rig: SetSource, task: CalibrationTask, display: CoachDisplay, work: BackgroundWork[Estimate]
+        self,
+        rig: SetSource,
+        task: CalibrationTask,
+        coach: Coach,
+        work: BackgroundWork[Estimate],
+        cancelled: threading.Event,
     ) -> None:
         capture = task.settings.capture
-        self._rig, self._task, self._display, self._work = rig, task, display, work
+        self._rig, self._task, self._coach, self._work = rig, task, coach, work
+        self._cancelled = cancelled
         self._sink = CalibrateSink(capture.frames, rig.description.camera_ids)
         self._due = deque(doublings(capture.frames))
         self._until_s = time.monotonic() + capture.wait_s
@@ -52,24 +65,25 @@ class _Round:
 
     def run(self) -> Estimate:
         """The first estimate that is the last of the round or contents the task's target."""
-        while True:
+        while not self._cancelled.is_set():
             if self._wanted:
                 self._collect()
             estimate = self._work.take(0.0 if self._wanted else _POLL_S)
             if estimate is not None:
                 last = self._final or (self._task.target is not None and self._task.contents(estimate))
-                self._display.show(estimate, last)
+                self._coach.show(estimate, last)
                 if last:
                     return estimate
             self._go_on()
+        raise CaptureCancelledError
 
     def _collect(self) -> None:
         panorama = self._rig.next_panorama(_POLL_S)
         more = True if panorama is None else self._sink.take(panorama)
         self._wanted = more and not self._rig.ended and time.monotonic() < self._until_s
         if not (self._wanted or self._task.coached):
-            self._rig.close()  # decoding, and simulated agents, would only slow down what follows
-        self._display.collected(self._sink.complete, self._task.settings.capture.frames)
+            self._rig.end_sets()  # decoding, and simulated agents, would only slow down what follows
+        self._coach.collected(self._sink.complete, self._task.settings.capture.frames)
 
     def _go_on(self) -> None:
         """Begin the next estimate when it is due and the one before has ended."""
@@ -88,9 +102,9 @@ class _Round:
             self._start(*self._sink.chosen())
 
     def _start(self, panoramas: list[PanoramicFrame], warnings: tuple[str, ...]) -> None:
-        self._display.begun(len(panoramas))
+        self._coach.begun(len(panoramas), self._final)
         work = partial(self._task.estimate, self._rig.description, panoramas, warnings)
-        self._work.start(work, self._display.tell)
+        self._work.start(work, self._coach.tell)
 
 
 def doublings(count: int) -> list[int]:
@@ -98,7 +112,7 @@ def doublings(count: int) -> list[int]:
     return [1 << k for k in range(count.bit_length()) if 1 << k < count]
 
 
-def _skip_waiting_sets(rig: Rig) -> None:
+def _skip_waiting_sets(rig: SetSource) -> None:
     """Sets that came before now show the room as it was."""
     while not rig.ended and rig.next_panorama(0.0) is not None:
         continue

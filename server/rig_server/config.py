@@ -18,6 +18,7 @@ from rig_server.synchroniser import Policy
 ENVIRONMENT_PREFIX = "RIG_SERVER_"
 CONFIG_PLACES = (Path("rig.toml"), Path("/etc/kinect-rig/rig.toml"))
 DEFAULT_PORT = 4012
+MAX_SETS = 100  # of one calibration: more average nothing away, and fill the memory
 MAX_CAMERAS = 64  # what one server holds in memory and one roster names; a ring has twelve
 CAMERA_NAME = r"^[A-Za-z0-9][A-Za-z0-9_.-]{0,31}$"  # it names folders and files
 
@@ -102,7 +103,7 @@ class LinkSettings(Settings):
 class CaptureSettings(Settings):
     """What `--calibrate` waits for and collects."""
 
-    frames: int = Field(5, ge=1, le=100)
+    frames: int = Field(5, ge=1, le=MAX_SETS)
     """Panoramic frames to calibrate on."""
     target_deg: float | None = Field(None, gt=0, le=180, examples=[0.1])
     """End as soon as every pair of neighbours is expected to be known this well (root mean square)."""
@@ -130,6 +131,8 @@ class RecordingSettings(Settings):
     """Size from which on the recording goes on in another file: FILE.001.mcap, FILE.002.mcap, ..."""
     keep_free_mib: int = Field(64, ge=0, le=1 << 30)
     """Room on the disk that a recording leaves: where there is less, it ends in order."""
+    folder: Path = Path()
+    """Where takes go whose start was asked of the running server; relative to this file."""
     queue_mib: int = Field(256, ge=8, le=1 << 20)
     """Memory for frames that wait for a slow disk; what does not fit is dropped, and told in the file."""
 
@@ -253,11 +256,13 @@ def load_rig_settings(file: Path | None, overrides: Mapping[str, Any] | None = N
     if found is None:
         return settings
     cameras = [_beside(found, camera) for camera in settings.cameras]
-    watch = settings.watch
+    watch, recording = settings.watch, settings.recording
     # Where the command line names a calibration, it is relative to where that was typed.
     if watch.calibration is not None and not _overridden(overrides, "watch", "calibration"):
         watch = watch.model_copy(update={"calibration": found.parent / watch.calibration})
-    return settings.model_copy(update={"cameras": tuple(cameras), "watch": watch})
+    if "folder" in recording.model_fields_set and not _overridden(overrides, "recording", "folder"):
+        recording = recording.model_copy(update={"folder": found.parent / recording.folder})
+    return settings.model_copy(update={"cameras": tuple(cameras), "watch": watch, "recording": recording})
 
 
 def settings_file() -> Path | None:

@@ -8,18 +8,18 @@ import contextlib
 import logging
 import time
 from collections import deque
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from typing import Protocol
 
 from rig_protocol.errors import RigError
-from rig_protocol.events import Outcome
+from rig_protocol.events import ControlAnswered, Outcome
 from rig_protocol.frames import PanoramicFrame, RgbdFrame
+from rig_protocol.messages import ControlValue, Hello
 from rig_protocol.rig_folder import RigDescription
 from rig_protocol.troubleshooting import Topic
 from rig_server.config import CaptureSettings
 from rig_server.projector_groups import Groups, assign_groups
 from rig_server.receiver import rig_time_ns
-from rig_server.rig import Rig
 
 logger = logging.getLogger(__name__)
 
@@ -44,13 +44,28 @@ class SetSource(Protocol):
         """The next set, or None when none came in time."""
         ...
 
-    def close(self) -> None:
+    def end_sets(self) -> None:
         """No more sets are needed."""
         ...
 
 
+class GroupableRig(SetSource, Protocol):
+    """A rig whose cameras can be told, too."""
+
+    @property
+    def hellos(self) -> Mapping[int, Hello]:
+        """What the agents said of themselves, by camera id."""
+        ...
+
+    def control(
+        self, cameras: int | Collection[int] | None, name: str, value: ControlValue
+    ) -> Mapping[int, ControlAnswered]:
+        """Have cameras do something; the answers by camera id."""
+        ...
+
+
 @contextlib.contextmanager
-def sets_of(rig: Rig, capture: CaptureSettings) -> Iterator[SetSource]:
+def sets_of(rig: GroupableRig, capture: CaptureSettings) -> Iterator[SetSource]:
     """The rig's sets, in projector groups where the settings say so; all depth is on again afterwards."""
     if capture.projector_groups == 1:
         yield rig
@@ -65,7 +80,7 @@ def sets_of(rig: Rig, capture: CaptureSettings) -> Iterator[SetSource]:
 class GroupedSets:
     """Merged sets of a live rig: as many at a time as a calibration wants, then as many again."""
 
-    def __init__(self, rig: Rig, capture: CaptureSettings) -> None:
+    def __init__(self, rig: GroupableRig, capture: CaptureSettings) -> None:
         """ConfigurationError where the groups cannot keep neighbours apart."""
         self._rig = rig
         self._sets = capture.frames
@@ -122,10 +137,10 @@ class GroupedSets:
             if answer.outcome is not Outcome.DONE:
                 logger.error("camera %d: depth may still be off: %s", camera_id, answer.text)
 
-    def close(self) -> None:
+    def end_sets(self) -> None:
         """No more sets are needed."""
         self.all_on()
-        self._rig.close()
+        self._rig.end_sets()
 
     def _next_turn(self) -> None:
         group = self._groups[len(self._turns)]

@@ -37,7 +37,7 @@ class OperatorRequests:
         camera, name, value = request.get("camera"), request.get("name"), request.get("value")
         if not isinstance(name, str) or not isinstance(value, ControlValue):
             raise ConfigurationError("a control has a name, and a value that is a switch, a number or a word")
-        chosen = None if camera == ALL else _camera_id(camera, names)
+        chosen = None if camera == ALL else find_camera_id(camera, names)
         answers = self._rig.control(chosen, name, value)
         return {
             "results": [
@@ -76,7 +76,7 @@ class OperatorRequests:
         return {camera.camera_id: camera.name for camera in self._rig.status().cameras}
 
 
-def _camera_id(camera: Any, names: Mapping[int, str]) -> int:
+def find_camera_id(camera: Any, names: Mapping[int, str]) -> int:
     """A camera by id or name; ConfigurationError names those that there are."""
     for camera_id, name in names.items():
         if str(camera) in (str(camera_id), name):

@@ -140,10 +140,14 @@ class LivePipeline:
             self.start_recording(self._take)
         self._receiver.start()
 
-    def stop(self) -> None:
-        """Say goodbye to the cameras and end all threads; harmless when already stopped."""
+    def end_sets(self) -> None:
+        """Say goodbye to the cameras and end all threads but that of a recording, which stays open."""
         self._receiver.stop()
         self._decoder.close()
+
+    def stop(self) -> None:
+        """End all of it; harmless when already stopped."""
+        self.end_sets()
         self.stop_recording()
 
     def start_recording(self, take: Path) -> None:

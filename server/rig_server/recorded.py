@@ -57,6 +57,9 @@ class RecordedRig:
     def start(self) -> None:
         """A folder is always there."""
 
+    def end_sets(self) -> None:
+        """Nothing is open between two frames."""
+
     def stop(self) -> None:
         """Nothing is open between two frames."""
 

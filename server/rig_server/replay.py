@@ -10,6 +10,8 @@ from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
+from rig_calib.recorded_calibration import recorded_calibration
+from rig_calib.rig_calibration import RigCalibration
 from rig_protocol.codecs import keep_freed_memory
 from rig_protocol.decoding import decode_frame
 from rig_protocol.errors import ConfigurationError, DataError, RigError
@@ -25,7 +27,7 @@ from rig_server.config import RigSettings
 from rig_server.metrics import CameraMetrics, RateMeter, RigStatus
 from rig_server.receiver import rig_time_ns
 from rig_server.synchroniser import Synchroniser
-from rig_server.take_documents import recorded_calibration, recorded_hellos
+from rig_server.take_documents import recorded_hellos
 
 logger = logging.getLogger(__name__)
 
@@ -54,7 +56,7 @@ class ReplayedRig:
         self._recording, self._settings, self._options = Recording(take), settings, options
         self.description: RigDescription = self._recording.description
         self.hellos: dict[int, Hello] = recorded_hellos(self._recording.document(HELLOS), self.description)
-        self.calibration = recorded_calibration(self._recording)
+        self.calibration = _calibration_of(self._recording)
         self._has_sets = self._recording.has_sets
         span_s = (self._recording.end_ns - self._recording.start_ns) / 1e9
         if options.seek_s > span_s:
@@ -80,6 +82,10 @@ class ReplayedRig:
 
     def start(self) -> None:
         """A file is always there."""
+
+    def end_sets(self) -> None:
+        """End the decoders; harmless when already ended."""
+        self.stop()
 
     def stop(self) -> None:
         """End the decoders; harmless when already ended."""
@@ -187,6 +193,15 @@ class ReplayedRig:
             self._frames.update(frame.camera_id for frame in present)
             self._damaged.update(frame.camera_id for frame in present if frame.damaged)
         return panorama
+
+
+def _calibration_of(recording: Recording) -> RigCalibration | None:
+    """The one that the take brings; one that cannot be read is no reason not to play its images."""
+    try:
+        return recorded_calibration(recording)
+    except DataError as error:
+        logger.warning("%s; the take plays without it", error)
+        return None
 
 
 def with_sets(entries: Iterable[Entry], synchroniser: Synchroniser) -> Iterator[Entry]:

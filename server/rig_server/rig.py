@@ -68,6 +68,10 @@ class Feed(Protocol):
         """Begin."""
         ...
 
+    def end_sets(self) -> None:
+        """No more sets are needed; what is recorded stays open. Harmless when already ended."""
+        ...
+
     def stop(self) -> None:
         """End; harmless when already ended."""
         ...
@@ -209,6 +213,12 @@ class Rig:
                     self._watch.stop()
             if self._simulation is not None:
                 self._simulation.close()
+
+    def end_sets(self) -> None:
+        """End what makes sets: no more are needed. A recording stays open until `close`, for what follows."""
+        self._feed.end_sets()
+        if self._simulation is not None:
+            self._simulation.close()
 
     def next_panorama(self, timeout_s: float) -> PanoramicFrame | None:
         """The next set; None when none came within `timeout_s`. RigError when the rig broke."""

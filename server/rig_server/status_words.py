@@ -55,6 +55,14 @@ def alarms(status: RigStatus) -> list[str]:
     return told
 
 
+def recorded(recording: RecordingStatus) -> str:
+    """How a recording was that has been ended."""
+    told = f"recorded {_duration(recording.seconds)}, {recording.bytes / 1e9:.2f} GB to {recording.path}"
+    if recording.dropped:
+        told += f"; the disk was too slow for {recording.dropped} frames"
+    return told + (f"; it had ended before: {recording.ended}" if recording.ended is not None else "")
+
+
 def _recording(recording: RecordingStatus) -> str:
     """How long, how much, and for how long the disk has room at this rate."""
     rate = recording.bytes_per_s

@@ -1,7 +1,6 @@
 """What a recording tells of its rig beside frames: cameras, agents, settings, calibration; and back."""
 
 import functools
-import logging
 from collections.abc import Mapping
 from typing import Any
 
@@ -9,11 +8,9 @@ from rig_calib.rig_calibration import RigCalibration
 from rig_protocol.errors import DataError
 from rig_protocol.message_fields import codec_ids, integer, number, optional, text
 from rig_protocol.messages import Hello
-from rig_protocol.recording import CALIBRATION, DESCRIPTION, HELLOS, SETTINGS, Recording
+from rig_protocol.recording import CALIBRATION, DESCRIPTION, HELLOS, SETTINGS
 from rig_protocol.rig_folder import RigDescription
 from rig_server.config import MAX_CAMERAS, RigSettings
-
-logger = logging.getLogger(__name__)
 
 _MAX_TEXT = 64  # bytes, as in a hello
 _MAX_CODECS = 16
@@ -36,17 +33,6 @@ def take_documents(
     if calibration is not None:
         documents[CALIBRATION] = _calibration_document(calibration)
     return documents
-
-
-def recorded_calibration(recording: Recording) -> RigCalibration | None:
-    """The calibration of a recording; None where there is none, or none that this release can read."""
-    if CALIBRATION not in recording.attachments:
-        return None
-    try:
-        return RigCalibration.from_dict(recording.document(CALIBRATION))
-    except DataError as error:  # the images are worth playing all the same
-        logger.warning("the recording's %s is left out: %s", CALIBRATION, error)
-        return None
 
 
 def recorded_hellos(document: Any, description: RigDescription) -> dict[int, Hello]:

@@ -78,6 +78,7 @@ class TakeFile:
         self._path, self._part_bytes = path, part_bytes
         self._number, self._before = 0, 0
         self._documents: Mapping[str, Any] = {}
+        self._attached: dict[str, Any] = {}
         self._open()
 
     @property
@@ -116,11 +117,14 @@ class TakeFile:
         self._disk = DiskFile(part_path(self._path, self._number))
         created = datetime.now(UTC).isoformat(timespec="seconds")
         self._writer = RecordingWriter(self._disk, created, rig_time_ns())
+        self._attached.clear()
         self._attach()
 
     def _attach(self) -> None:
         for name, values in self._documents.items():
-            self._writer.attach(name, values, rig_time_ns())
+            if self._attached.get(name) is not values:  # writing a calibration as JSON takes some ms
+                self._writer.attach(name, values, rig_time_ns())
+                self._attached[name] = values
 
     def _finish_part(self, cameras: Mapping[str, Mapping[str, int]]) -> None:
         self._writer.finish(cameras, rig_time_ns())

@@ -58,7 +58,7 @@ def test_a_terminal_shows_what_any_part_tells() -> None:
     with CoachDisplay(console) as display:
         display.connected(3, 12)
         display.collected(2, 5)
-        display.begun(1)
+        display.begun(1, last=False)
         display.tell("matching", 0.4)
         display.show(estimate(), last=True)
     text: str = console.file.getvalue()  # type: ignore[attr-defined]

@@ -50,7 +50,7 @@ class FakeRig:
             self._sets.append(panorama(self._next))
         return self._sets.pop(0) if self._sets else None
 
-    def close(self) -> None:
+    def end_sets(self) -> None:
         self.closed = True
 
 

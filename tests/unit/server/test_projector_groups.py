@@ -96,7 +96,7 @@ class FakeRing:
         }
         return PanoramicFrame.of(self.sets, frames)
 
-    def close(self) -> None:
+    def end_sets(self) -> None:
         self.closed = True
 
 
@@ -176,7 +176,7 @@ def test_the_projectors_shine_again_before_the_rig_is_closed() -> None:
     rig = FakeRing()
     sets = grouped(rig)
     sets.next_panorama(0.0)
-    sets.close()
+    sets.end_sets()
     assert rig.closed
     assert rig.on == set(range(4))
 
