@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from rig_calib.capture_cli import AsJson, Folder, Frames, Out, add_capture_commands
 from rig_protocol.programs import run_program, set_up_logging
 from rig_protocol.troubleshooting import Topic
 
@@ -42,16 +43,6 @@ app = typer.Typer(
     help="Calibrate a ring of RGB-D cameras from what they see, and fuse it.",
     context_settings={"help_option_names": ["-h", "--help"]},
 )
-
-Folder = Annotated[
-    Path, typer.Argument(help="Rig folder (nominal.json, one subfolder a camera), or a recording FILE.mcap.")
-]
-Out = Annotated[Path, typer.Option(help="Folder for the results.")]
-Frames = Annotated[
-    int | None,
-    typer.Option(min=1, max=100, help="Panoramic frames to use; else all (at most 100), 5 of a take."),
-]
-AsJson = Annotated[bool, typer.Option("--json", help="Print the result as JSON, and nothing else.")]
 
 
 @app.command()
@@ -125,33 +116,6 @@ def evaluate(
         _print_json(evaluation.to_dict())
     else:
         Console(highlight=False).print(evaluation_table(evaluation))
-
-
-@app.command()
-def fuse(
-    folder: Folder,
-    out: Out,
-    calibration: Annotated[
-        Path | None,
-        typer.Option(help="The calibration.json of this rig; else the one that a recording brings."),
-    ] = None,
-    frames: Frames = None,
-) -> None:
-    """Fuse a rig folder or a recording with a calibration into cloud.ply and panorama.png."""
-    from rich.console import Console
-
-    from rig_calib.outputs import make_output_folder, write_fused
-    from rig_calib.recorded_calibration import calibration_for
-    from rig_calib.rig_folder_calibration import read_description, read_views
-
-    known = calibration_for(folder, calibration)
-    views = read_views(folder, read_description(folder), frames)
-    make_output_folder(out)
-    fused = write_fused(out, known, views)
-    console = Console(highlight=False)
-    console.print(f"{len(fused.cloud):,} points in {out / 'cloud.ply'}")
-    for why in fused.cloud.skipped:
-        console.print(why, style="yellow")
 
 
 @app.command()
@@ -291,43 +255,7 @@ def pattern(
     )
 
 
-@app.command()
-def export(
-    calibration: Annotated[Path, typer.Argument(help="A calibration.json.")],
-    form: Annotated[
-        str, typer.Option("--format", metavar="kalibr|ros2|urdf|colmap|nerfstudio|opencv", help="For whom.")
-    ],
-    out: Annotated[Path, typer.Option(help="File to write, or a folder; for colmap always a folder.")],
-    rig: Annotated[
-        Path | None,
-        typer.Option(
-            help="Where intrinsics stand: the rig folder (with its images), nominal.json or rig.toml."
-        ),
-    ] = None,
-    frames: Annotated[
-        int,
-        typer.Option(min=1, max=10_000, help="Panoramic frames of the folder to list: its rig was at rest."),
-    ] = 1,
-) -> None:
-    """Write a calibration for another program; docs/exports.md says which axes and how to load it."""
-    from rich.console import Console
-
-    from rig_calib.exports.exported_rig import exported_rig
-    from rig_calib.exports.formats import find_format, target_folder, write_export
-    from rig_calib.exports.known_rig import KnownRig, read_known_rig
-
-    chosen, result = find_format(form), _load(calibration)
-    known = KnownRig() if rig is None else read_known_rig(rig, frames)
-    exported = exported_rig(
-        result, known.models, known.images, known.image_root_from(target_folder(chosen, out))
-    )
-    made = chosen.export(exported)
-    console = Console(highlight=False, soft_wrap=True)
-    for path in write_export(chosen, made, out):
-        console.print(str(path), markup=False)
-    failed = [f"this calibration did not pass its gate: {why}" for why in result.failures]
-    for note in [*failed, *known.left_out(result.poses), *made.notes]:
-        console.print(note, style="yellow", markup=False)
+add_capture_commands(app)
 
 
 def main() -> None:

@@ -1,4 +1,4 @@
-"""The calibration that a recording brings: the one in force when it ended."""
+"""The calibration that a recording carries: the one in force when it ended."""
 
 from pathlib import Path
 
@@ -9,7 +9,7 @@ from rig_protocol.recording import CALIBRATION, Recording
 
 
 def recorded_calibration(recording: Recording) -> RigCalibration | None:
-    """None where it brings none; DataError where that is malformed, or of another schema."""
+    """None where it carries none; DataError where that is malformed, or of another schema."""
     if CALIBRATION not in recording.attachments:
         return None
     try:
@@ -19,7 +19,7 @@ def recorded_calibration(recording: Recording) -> RigCalibration | None:
 
 
 def calibration_for(capture: Path, file: Path | None) -> RigCalibration:
-    """The calibration in `file`, else that which the capture brings.
+    """The calibration in `file`, else that which the capture carries.
 
     ConfigurationError where there is neither, DataError for a malformed one.
     """
@@ -27,5 +27,5 @@ def calibration_for(capture: Path, file: Path | None) -> RigCalibration:
         return RigCalibration.load(file)
     found = recorded_calibration(Recording(capture)) if is_recording(capture) else None
     if found is None:
-        raise ConfigurationError(f"{capture} brings no calibration: name one with --calibration FILE")
+        raise ConfigurationError(f"{capture} carries no calibration: name it with --calibration FILE")
     return found

@@ -68,6 +68,8 @@ class CalibrationRun:
             self.log.ready()
         finally:
             self.sets.end_sets()
+            if self.sets.passed_over:
+                logger.info("the calibration did not keep up with %d sets", self.sets.passed_over)
 
     def _wait_for_cameras(self) -> None:
         settings = self._rig.settings

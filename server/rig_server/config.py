@@ -132,7 +132,7 @@ class RecordingSettings(Settings):
     keep_free_mib: int = Field(64, ge=0, le=1 << 30)
     """Room on the disk that a recording leaves: where there is less, it ends in order."""
     folder: Path = Path()
-    """Where takes go whose start was asked of the running server; relative to this file."""
+    """Where takes go that are begun while the server runs; relative to where it was started."""
     queue_mib: int = Field(256, ge=8, le=1 << 20)
     """Memory for frames that wait for a slow disk; what does not fit is dropped, and told in the file."""
 
@@ -256,13 +256,11 @@ def load_rig_settings(file: Path | None, overrides: Mapping[str, Any] | None = N
     if found is None:
         return settings
     cameras = [_beside(found, camera) for camera in settings.cameras]
-    watch, recording = settings.watch, settings.recording
+    watch = settings.watch
     # Where the command line names a calibration, it is relative to where that was typed.
     if watch.calibration is not None and not _overridden(overrides, "watch", "calibration"):
         watch = watch.model_copy(update={"calibration": found.parent / watch.calibration})
-    if "folder" in recording.model_fields_set and not _overridden(overrides, "recording", "folder"):
-        recording = recording.model_copy(update={"folder": found.parent / recording.folder})
-    return settings.model_copy(update={"cameras": tuple(cameras), "watch": watch, "recording": recording})
+    return settings.model_copy(update={"cameras": tuple(cameras), "watch": watch})
 
 
 def settings_file() -> Path | None:

@@ -5,6 +5,9 @@ from pathlib import Path
 
 import numpy as np
 
+from rig_calib.recorded_calibration import recorded_calibration
+from rig_calib.rig_calibration import RigCalibration
+from rig_protocol.recording import Recording
 from rig_server import Rig
 from support.rig_processes import (
     AgentProcess,
@@ -37,6 +40,9 @@ def test_a_replayed_calibration_is_bit_identical(tmp_path: Path) -> None:
     assert first["edges"] == second["edges"] != []
     assert second["provenance"]["source"] == "recording"
     assert first["provenance"]["agents"] == second["provenance"]["agents"] == 2
+    brought = recorded_calibration(Recording(take))
+    assert (brought is not None) == (live.returncode == 0), "a take brings what passes its gate"
+    assert brought is None or brought.to_dict() == RigCalibration.from_dict(first).to_dict()
 
 
 def test_recorded_cameras_stream_to_a_server_as_live_ones(tmp_path: Path) -> None:

@@ -1,28 +1,22 @@
 """Estimates of a calibration whose outcome a test decides, in place of the solver."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
 from rig_calib.calibration import CalibrationResult
 from rig_calib.coaching import PairSupport, Support
-from rig_calib.rig_calibration import CalibratedCamera, RigCalibration
 from rig_protocol.frames import PanoramicFrame
 from rig_protocol.poses import Pose
 from rig_protocol.rig_folder import RigDescription
 from rig_server.calibration_task import CalibrationTask, Estimate
-
-
-def calibration_of(poses: Mapping[int, Pose], **fields: object) -> RigCalibration:
-    """A calibration that says no more than where its cameras are."""
-    cameras = tuple(CalibratedCamera(i, f"cam{i:02d}", T) for i, T in poses.items())
-    return RigCalibration("joint", "ring", cameras, (), None, {}, 1, **fields)  # type: ignore[arg-type]
+from support.box_room import calibration_of
 
 
 @dataclass
 class ScriptedEstimates:
     """Stands for `CalibrationTask.estimate`; remembers on which sets each estimate was made."""
 
-    poses: Mapping[int, Pose] = field(default_factory=dict)
+    poses: dict[int, Pose] = field(default_factory=dict)
     failures: tuple[str, ...] = ()
     missed: str | None = None
     error: Exception | None = None

@@ -51,6 +51,10 @@ class DeviceImages:
         rgb = color_bgr[:, :, ::-1]
         return next((i for i, image in enumerate(self.color_rgb) if np.array_equal(image, rgb)), None)
 
+    def depth_index_of(self, depth_mm: npt.NDArray[np.uint16]) -> int | None:
+        """Which depth image this is, byte for byte."""
+        return next((i for i, image in enumerate(self.depth) if np.array_equal(image, depth_mm)), None)
+
 
 @functools.cache
 def device_images(count: int = 6) -> DeviceImages:

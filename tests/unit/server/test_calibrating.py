@@ -14,7 +14,9 @@ from rig_protocol.frames import RgbdFrame
 from rig_protocol.rig_folder import CameraEntry, RigDescription, write_rig_folder
 from rig_server import Rig
 from rig_server.calibrating import calibrate_rig
+from rig_server.capture_log import CaptureLog
 from rig_server.config import CaptureSettings, RigSettings
+from rig_server.session_view import Phase
 
 
 def test_a_result_that_fails_its_gate_says_why_and_its_files_are_written(tmp_path: Path) -> None:
@@ -34,8 +36,12 @@ def test_a_result_that_fails_its_gate_says_why_and_its_files_are_written(tmp_pat
     rig = Rig.open(tmp_path / "rig", RigSettings(capture=CaptureSettings(frames=3)))
     console = Console(file=io.StringIO(), width=80)
     (tmp_path / "out").mkdir()
+    log = CaptureLog(wanted=3)
     with pytest.raises(RigError, match=r"fails its gate: .*cam01.*not connected"):
-        calibrate_rig(rig, tmp_path / "out", console)
+        calibrate_rig(rig, tmp_path / "out", console, log=log)
+    assert rig.calibration is None, "what fails its gate is not in force"
+    assert (log.view.phase, log.view.sets, log.view.wanted) == (Phase.READY, 1, 3)
+    assert "not connected" in log.view.failures[0], "whoever looks on is told the same"
     written = {path.name for path in (tmp_path / "out").iterdir()}
     assert {"calibration.json", "report.html", "cloud.ply"} <= written
     result = json.loads((tmp_path / "out" / "calibration.json").read_text())

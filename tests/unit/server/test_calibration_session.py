@@ -23,7 +23,8 @@ from rig_server.config import CaptureSettings, RigSettings, SynchroniserSettings
 from rig_server.metrics import RigStatus
 from rig_server.offered_sets import OfferedSets
 from rig_server.receiver import rig_time_ns
-from support.scripted_estimates import ScriptedEstimates, calibration_of
+from support.box_room import calibration_of
+from support.scripted_estimates import ScriptedEstimates
 
 CAMERAS = (0, 1)
 RAW = np.full((2, 2), 900, np.uint16)
@@ -272,6 +273,29 @@ def test_a_cancelled_one_ends_and_the_next_begins(make: Callable[..., Beside]) -
     beside.run()
     beside.session.start()
     beside.until(Phase.READY)
+
+
+def test_one_that_was_given_up_and_still_switches_projectors_is_waited_for(
+    make: Callable[..., Beside], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("rig_server.calibration_session._PATIENCE_S", 0.05)
+    rig = RunningRig(projector_groups=2)
+    rig.hellos = {i: hello(i) for i in CAMERAS}
+    switching, switched = threading.Event(), threading.Event()
+
+    def control(cameras: Collection[int], _name: str, _value: bool) -> Mapping[int, ControlAnswered]:
+        switching.set()
+        assert switched.wait(30)
+        return {i: ControlAnswered(i, 0, Outcome.DONE, "") for i in cameras}
+
+    monkeypatch.setattr(rig, "control", control)
+    beside = make(rig)
+    beside.session.start()
+    assert switching.wait(30)
+    beside.session.cancel()
+    with pytest.raises(RigError, match="still ending"):
+        beside.session.start()
+    switched.set()
 
 
 @pytest.mark.parametrize(

@@ -1,0 +1,178 @@
+"""Commands of `rig-calib` that take a capture frame by frame: fuse, export."""
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+if TYPE_CHECKING:  # heavy: imported where they are used, so that --help is quick
+    from rich.console import Console
+
+Folder = Annotated[
+    Path, typer.Argument(help="Rig folder (nominal.json, one subfolder a camera), or a recording FILE.mcap.")
+]
+Out = Annotated[Path, typer.Option(help="Folder for the results.")]
+Frames = Annotated[
+    int | None,
+    typer.Option(min=1, max=100, help="Panoramic frames to use; else all (at most 100), 5 of a take."),
+]
+AsJson = Annotated[bool, typer.Option("--json", help="Print the result as JSON, and nothing else.")]
+Calibration = Annotated[
+    Path | None,
+    typer.Option(metavar="FILE", help="The calibration.json of the rig; else the one a recording carries."),
+]
+WorkerCount = Annotated[
+    int | None, typer.Option("--workers", min=1, max=256, help="Processes of this machine; else one a core.")
+]
+Scheduler = Annotated[
+    str | None,
+    typer.Option(metavar="ADDRESS", help="Work on the Dask cluster there instead, as tcp://10.0.0.1:8786."),
+]
+
+_EXPORT_EXAMPLES = """
+**Examples**
+
+`rig-calib export results/calibration.json --format ros2 --out rig.launch.py` — the calibration, for a program
+
+`rig-calib export take.mcap --format foxglove --out view.mcap` — images, cloud and transforms, for Foxglove
+"""
+
+
+def fuse(
+    folder: Folder,
+    out: Out,
+    calibration: Calibration = None,
+    frames: Frames = None,
+) -> None:
+    """Fuse a rig folder or a recording with a calibration into cloud.ply and panorama.png."""
+    from rich.console import Console
+
+    from rig_calib.outputs import make_output_folder, write_fused
+    from rig_calib.recorded_calibration import calibration_for
+    from rig_calib.rig_folder_calibration import read_description, read_views
+
+    known = calibration_for(folder, calibration)
+    views = read_views(folder, read_description(folder), frames)
+    make_output_folder(out)
+    fused = write_fused(out, known, views)
+    console = Console(highlight=False)
+    console.print(f"{len(fused.cloud):,} points in {out / 'cloud.ply'}")
+    for why in fused.cloud.skipped:
+        console.print(why, style="yellow")
+
+
+def export(
+    source: Annotated[
+        Path, typer.Argument(help="A calibration.json; or frames: a rig folder, or a recording FILE.mcap.")
+    ],
+    form: Annotated[
+        str,
+        typer.Option(
+            "--format",
+            metavar="FORMAT",
+            help="kalibr, ros2, urdf, colmap, nerfstudio, opencv; of frames others. See docs/exports.md.",
+        ),
+    ],
+    out: Annotated[Path, typer.Option(help="File to write, or a folder, as the format has it.")],
+    rig: Annotated[
+        Path | None,
+        typer.Option(
+            help="Of a calibration, where intrinsics stand: the rig folder (with its images), nominal.json "
+            "or rig.toml."
+        ),
+    ] = None,
+    calibration: Calibration = None,
+    frames: Annotated[
+        int | None,
+        typer.Option(
+            min=1,
+            help="Panoramic frames: of a calibration those of --rig to list (1), of frames how many (all).",
+        ),
+    ] = None,
+    first: Annotated[int, typer.Option(min=0, help="Of frames: leave out so many at the beginning.")] = 0,
+    every: Annotated[int, typer.Option(min=1, help="Of frames: one in so many.")] = 1,
+    fps: Annotated[float, typer.Option(min=0.1, max=240, help="Of a video: frames a second.")] = 30.0,
+    workers: WorkerCount = None,
+    scheduler: Scheduler = None,
+) -> None:
+    """Write a calibration, or the frames of a capture, for another program (docs/exports.md)."""
+    from rich.console import Console
+
+    from rig_calib.frame_exports.formats import FORMATS
+
+    console = Console(highlight=False, soft_wrap=True)
+    if form in FORMATS:
+        _export_frames(
+            console,
+            form,
+            source,
+            out,
+            calibration,
+            slice(first, None if frames is None else first + frames * every, every),
+            fps,
+            workers,
+            scheduler,
+        )
+    else:
+        _export_calibration(console, form, source, out, rig, frames or 1)
+
+
+def _export_calibration(
+    console: "Console", form: str, path: Path, out: Path, rig: Path | None, frames: int
+) -> None:
+    from rig_calib.exports.exported_rig import exported_rig
+    from rig_calib.exports.formats import find_format, target_folder, write_export
+    from rig_calib.exports.known_rig import KnownRig, read_known_rig
+    from rig_calib.rig_calibration import RigCalibration
+
+    chosen, result = find_format(form), RigCalibration.load(path)
+    known = KnownRig() if rig is None else read_known_rig(rig, frames)
+    exported = exported_rig(
+        result, known.models, known.images, known.image_root_from(target_folder(chosen, out))
+    )
+    made = chosen.export(exported)
+    for written in write_export(chosen, made, out):
+        console.print(str(written), markup=False)
+    failed = [f"this calibration did not pass its gate: {why}" for why in result.failures]
+    for note in [*failed, *known.left_out(result.poses), *made.notes]:
+        console.print(note, style="yellow", markup=False)
+
+
+def _export_frames(
+    console: "Console",
+    form: str,
+    path: Path,
+    out: Path,
+    calibration: Path | None,
+    chosen: slice,
+    fps: float,
+    workers: int | None,
+    scheduler: str | None,
+) -> None:
+    from rig_calib.frame_exports.formats import FORMATS
+    from rig_calib.frame_exports.job import ExportJob
+    from rig_calib.offline.capture import open_capture
+    from rig_calib.offline.workers import open_workers
+    from rig_calib.rig_calibration import RigCalibration
+    from rig_calib.terminal import progress_bar
+    from rig_protocol.errors import ConfigurationError
+
+    exporter, capture = FORMATS[form].exporter(), open_capture(path)
+    positions = range(*chosen.indices(len(capture.marks)))
+    if not positions:
+        raise ConfigurationError(f"{path} holds {len(capture.marks)} panoramic frames: none is left")
+    known = capture.calibration if calibration is None else RigCalibration.load(calibration)
+    with progress_bar(console) as tell, open_workers(workers, scheduler) as hands:
+        exported = exporter(
+            ExportJob(capture, positions, out, hands, known, fps, lambda share: tell(form, share))
+        )
+    for written in exported.paths:
+        console.print(str(written), markup=False)
+    for note in exported.notes:
+        console.print(note, style="yellow", markup=False)
+
+
+def add_capture_commands(app: typer.Typer) -> None:
+    """Add them to the program."""
+    app.command()(fuse)
+    app.command(epilog=_EXPORT_EXAMPLES)(export)

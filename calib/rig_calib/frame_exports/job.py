@@ -1,0 +1,46 @@
+"""What an export is asked to do, and what it has written."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from pathlib import Path
+
+from rig_calib.offline.capture import Capture
+from rig_calib.offline.workers import Tell, Workers
+from rig_calib.rig_calibration import RigCalibration
+from rig_protocol.errors import ConfigurationError
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class ExportJob:
+    """Positions of a capture, to `out`: a file or a folder, as the format has it.
+
+    `calibration`: the given one, else the capture's own, else None. `fps`: frames a second of a video.
+    """
+
+    capture: Capture
+    positions: range
+    out: Path
+    workers: Workers
+    calibration: RigCalibration | None = None
+    fps: float = 30.0
+    tell: Tell = field(default=lambda _share: None)
+
+    def needed_calibration(self) -> RigCalibration:
+        """The calibration; ConfigurationError where there is none."""
+        if self.calibration is None:
+            raise ConfigurationError(
+                f"{self.capture.path} carries no calibration, and this format needs one: name it with "
+                "--calibration FILE"
+            )
+        return self.calibration
+
+
+@dataclass(frozen=True, slots=True)
+class Exported:
+    """What was written, and what a person should know of it."""
+
+    paths: tuple[Path, ...]
+    notes: tuple[str, ...] = ()
+
+
+Exporter = Callable[[ExportJob], Exported]
