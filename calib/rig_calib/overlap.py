@@ -102,7 +102,7 @@ def shared_regions(
 
 
 def seen_grid(of: Intrinsics, by: Intrinsics, T_by_of: Pose) -> npt.NDArray[np.bool_]:
-    """On a coarse grid (rows, columns) all over image `of`: where `by` sees something of the sensor's range."""
+    """Where, on a coarse grid (rows, columns) all over image `of`, camera `by` sees at any depth."""
     pixels, rays = _grid(of)
     pinhole = np.array([by.fx, by.fy, by.cx, by.cy])
     low = np.array([-0.5, -0.5])

@@ -278,7 +278,7 @@ def _receive(settings: "RigSettings", origin: "Origin", terminal: Console) -> No
     from rig_server.opening import open_rig
     from rig_server.receiving import receive
 
-    with open_rig(settings, origin, terminal, calibrates=False) as rig:
+    with open_rig(settings, origin, terminal) as rig:
         receive(rig, terminal)
 
 
@@ -294,16 +294,18 @@ def _calibrate(
     from rig_calib.outputs import known_calibration, make_output_folder
     from rig_server.calibrating import calibrate_rig
     from rig_server.calibration_task import CalibrationTask
+    from rig_server.capture_log import CaptureLog
     from rig_server.opening import open_rig
 
     known = known_calibration(recalibrate, calibration, folder)
     make_output_folder(folder)
-    with open_rig(settings, origin, terminal, calibrates=True) as rig:
+    log = CaptureLog(settings.capture.frames)
+    with open_rig(settings, origin, terminal, log) as rig:
         if recalibrate is None or known is None:
             task = CalibrationTask.whole_rig(rig.settings, coach)
         else:
             task = CalibrationTask.one_camera(rig.settings, known, recalibrate, coach)
-        calibrate_rig(rig, folder, terminal, task)
+        calibrate_rig(rig, folder, terminal, task, log)
 
 
 add_operator_commands(app)

@@ -10,20 +10,18 @@ from typing import Generic, TypeVar
 
 logger = logging.getLogger(__name__)
 
-_NICENESS = 10  # whatever else the server does comes first
-
 Item = TypeVar("Item")
 
 
 class LatestOnly(Generic[Item]):
     """Runs `work` from `start` to `stop`. Offering never waits; an item that nobody took yet is replaced.
 
-    `every_s`: at least so long between the beginnings of two works. An error of `work` is logged and shown by
-    `failure`; the next item is tried again.
+    `every_s`: at least so long between the beginnings of two works. `niceness`: of the thread. An error of
+    `work` is logged and shown by `failure`; the next item is tried again.
     """
 
-    def __init__(self, name: str, work: Callable[[Item], None], every_s: float) -> None:
-        self._name, self._work, self._every_s = name, work, every_s
+    def __init__(self, name: str, work: Callable[[Item], None], every_s: float, niceness: int) -> None:
+        self._name, self._work, self._every_s, self._niceness = name, work, every_s, niceness
         self._changed = threading.Condition()  # guards what follows
         self._item: Item | None = None
         self._stopping = False
@@ -56,7 +54,7 @@ class LatestOnly(Generic[Item]):
 
     def _run(self) -> None:
         with contextlib.suppress(OSError, AttributeError):  # Linux alone has priorities of threads
-            os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), _NICENESS)
+            os.setpriority(os.PRIO_PROCESS, threading.get_native_id(), self._niceness)
         while (item := self._next()) is not None:
             try:
                 self._work(item)

@@ -11,6 +11,7 @@ from rig_calib.outputs import NAME
 from rig_calib.rig_calibration import RigCalibration
 from rig_protocol.errors import ConfigurationError
 from rig_server.announcement import announced
+from rig_server.capture_log import CaptureLog
 from rig_server.config import RigSettings
 from rig_server.metrics_endpoint import metrics_served
 from rig_server.operator_requests import OperatorRequests
@@ -46,10 +47,12 @@ class Origin:
 
 
 @contextlib.contextmanager
-def open_rig(settings: RigSettings, origin: Origin, terminal: Console, calibrates: bool) -> Iterator[Rig]:
+def open_rig(
+    settings: RigSettings, origin: Origin, terminal: Console, log: CaptureLog | None = None
+) -> Iterator[Rig]:
     """The rig that the options ask for, not begun yet, and everything that serves it until the block ends.
 
-    `calibrates`: the command line has it calibrated; a console then looks on.
+    `log`: the calibration that the command line asks for, which a console looks on.
     """
     announces = settings.announce and origin.live
     with (
@@ -60,16 +63,16 @@ def open_rig(settings: RigSettings, origin: Origin, terminal: Console, calibrate
         contextlib.ExitStack() as with_console,
     ):
         if settings.console.listen is not None:
-            if origin.live and not calibrates:
+            if origin.live and log is None:
                 _take_up_calibration(rig)
-            _serve_console(with_console, rig, terminal, calibrates)
+            _serve_console(with_console, rig, terminal, log)
         yield rig
 
 
-def _serve_console(stack: contextlib.ExitStack, rig: Rig, terminal: Console, calibrates: bool) -> None:
+def _serve_console(stack: contextlib.ExitStack, rig: Rig, terminal: Console, log: CaptureLog | None) -> None:
     from rig_server.console.console import RigConsole  # it takes a second to import
 
-    console = stack.enter_context(RigConsole(rig, orders=not calibrates))
+    console = stack.enter_context(RigConsole(rig, log))
     terminal.print(f"console at {console.link}", soft_wrap=True, markup=False, highlight=False)
 
 

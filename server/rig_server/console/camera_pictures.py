@@ -1,4 +1,4 @@
-"""What one camera sees as a picture for people: colour, depth in colours, overlaps tinted; as sensors stand."""
+"""What one camera sees, as a picture for people: colour, depth in colours, overlaps tinted."""
 
 from enum import StrEnum
 from functools import lru_cache
@@ -8,7 +8,7 @@ import numpy as np
 import numpy.typing as npt
 
 from rig_protocol.camera import RawDepthModel
-from rig_protocol.frames import ImageU8, ImageU16, RgbdFrame
+from rig_protocol.frames import NO_DISPARITY, ImageU8, ImageU16, RgbdFrame
 
 _NEAR_M, _FAR_M = 0.5, 5.0
 _NOTHING_BGR = (26, 22, 20)
@@ -64,17 +64,18 @@ def depth_picture(frame: RgbdFrame, raw_model: RawDepthModel, full: bool) -> Ima
     """(H,W,3) BGR, near red, far blue, dark where nothing was measured; None where there is no depth."""
     step = 1 if full else 2
     if frame.raw is not None:
-        return np.take(_raw_table(raw_model), frame.raw[::step, ::step] & (_TABLE_SIZE - 1), axis=0)
+        disparity = np.minimum(frame.raw[::step, ::step], NO_DISPARITY)
+        return np.asarray(_raw_table(raw_model)[disparity], np.uint8)
     if frame.depth_mm is None:
         return None
     depth: ImageU16 = frame.depth_mm[::step, ::step] // np.uint16(_MM_STEP)
-    return np.take(_MM_TABLE, np.minimum(depth, _TABLE_SIZE - 1), axis=0)
+    return np.asarray(_MM_TABLE[np.minimum(depth, _TABLE_SIZE - 1)], np.uint8)
 
 
 def distance_picture(distance_m: npt.NDArray[np.float32]) -> ImageU8:
     """The same of distances (H,W) in metres, NaN where nothing was measured."""
     steps = np.nan_to_num(distance_m * (1000.0 / _MM_STEP), nan=0.0, posinf=0.0).astype(np.int32)
-    return np.take(_MM_TABLE, np.clip(steps, 0, _TABLE_SIZE - 1), axis=0)
+    return np.asarray(_MM_TABLE[np.clip(steps, 0, _TABLE_SIZE - 1)], np.uint8)
 
 
 def jpeg(image: ImageU8) -> bytes:
@@ -101,14 +102,16 @@ def _resized(image: ImageU8, size: tuple[int, int]) -> ImageU8:
 def _table(depth_m: npt.NDArray[np.float64]) -> ImageU8:
     """Colours (N,3) of depths; those that are not positive are nothing."""
     known = np.isfinite(depth_m) & (depth_m > 0)
-    nearness = 1 - (np.where(known, depth_m, _FAR_M) - _NEAR_M) / (_FAR_M - _NEAR_M)
-    levels = np.clip(np.rint(255 * (0.06 + 0.88 * np.clip(nearness, 0, 1))), 0, 255).astype(np.uint8)
+    # Between equal steps of depth and of disparity: near and far can both be told apart.
+    inverse_m = 1 / np.where(known, depth_m, _FAR_M)
+    nearness = np.sqrt(np.clip((inverse_m - 1 / _FAR_M) / (1 / _NEAR_M - 1 / _FAR_M), 0, 1))
+    levels = np.clip(np.rint(255 * (0.06 + 0.88 * nearness)), 0, 255).astype(np.uint8)
     colors = np.asarray(cv2.applyColorMap(levels[:, None], cv2.COLORMAP_TURBO), np.uint8)[:, 0]
     colors[~known] = _NOTHING_BGR
     return colors
 
 
-_MM_TABLE = _table(np.arange(_TABLE_SIZE) * (_MM_STEP / 1000.0))
+_MM_TABLE = _table(np.arange(_TABLE_SIZE, dtype=np.float64) * (_MM_STEP / 1000.0))
 
 
 @lru_cache(maxsize=256)

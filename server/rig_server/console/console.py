@@ -1,4 +1,4 @@
-"""The console of one rig: what is taken there is shown in a browser, and what a person wants there is done."""
+"""The console of one rig: shows in a browser what is taken, and has done what a person wants."""
 
 import threading
 import time
@@ -14,6 +14,7 @@ from rig_calib.rig_calibration import RigCalibration
 from rig_protocol.errors import ConfigurationError, RigError
 from rig_protocol.frames import ImageU8, PanoramicFrame
 from rig_server.calibration_session import CalibrationSession
+from rig_server.capture_log import CaptureLog
 from rig_server.console.access import console_token
 from rig_server.console.camera_pictures import Mode, distance_picture, jpeg
 from rig_server.console.picture_guide import PictureGuide
@@ -32,6 +33,7 @@ from rig_server.receiver import rig_time_ns
 from rig_server.rig import Rig
 from rig_server.sinks.fuse import FuseSink
 
+_TILE_NICENESS = 2  # receiving and decoding come first
 _GUIDE_AGE_S = 2.0  # what is known of the cameras may mean reading files
 _STRIP_PX = 1600
 _LATENCY = "received_to_painted"
@@ -67,16 +69,19 @@ class RigConsole:
     It sees a calibration that waits for its decision as if it were in force: that is its preview.
     """
 
-    def __init__(self, rig: Rig, orders: bool = True) -> None:
-        """Binds its port. `orders`: whether a person may have the rig do something; else one looks on.
+    def __init__(self, rig: Rig, looked_on: CaptureLog | None = None) -> None:
+        """Binds its port. `looked_on`: a calibration that others make, which a person can look on only.
 
         RigError when the port is in use, ConfigurationError when address or token make no sense.
         """
-        self._orders = orders
+        self._orders = looked_on is None
         settings = rig.settings.console
         self._rig = rig
         self._session = CalibrationSession(rig, settings.folder)
+        if looked_on is not None:
+            self._session.look_on(looked_on)
         self._actions = RigActions(rig, self._session)
+        self._place = rig.place  # the rig may end before its console
         self._history = HealthHistory()
         self._latency, self._recent_latency = (
             Histogram([ms * 1_000_000 for ms in _LATENCY_MS]),
@@ -99,7 +104,9 @@ class RigConsole:
             raise
         told = token if settings.token_file is None else f"(what {settings.token_file} holds)"
         self.link = f"{self._server.url}?token={told}"
-        self._tiles = LatestOnly[tuple[PanoramicFrame, int]]("tiles", self._make_tiles, 1 / settings.tile_hz)
+        self._tiles = LatestOnly[tuple[PanoramicFrame, int]](
+            "tiles", self._make_tiles, 1 / settings.tile_hz, _TILE_NICENESS
+        )
         self._fuse = FuseSink(self._calibration, lambda: rig.description, self._show, 1 / settings.fused_hz)
 
     def __enter__(self) -> Self:
@@ -117,6 +124,7 @@ class RigConsole:
         self._server.__exit__(kind, error, trace)
         self._fuse.stop()
         self._tiles.stop()
+        self._actions.close()
         self._session.close()
         self._scene.close()
 
@@ -126,14 +134,13 @@ class RigConsole:
         for camera_id, frame in panorama.frames.items():
             if frame is not None:
                 self._last_s[camera_id] = now_s
-        if self._orders:
-            self._session.offer(panorama)
+        self._session.offer(panorama)
         if self._server.watched:
             self._tiles.offer((panorama, rig_time_ns()))
             self._fuse.offer(panorama)
 
     def latency(self) -> HistogramSnapshot:
-        """From a frame's last datagram to its painted tile, and the way of the page's word back; since start."""
+        """From a frame's last datagram to its painted tile, the page's word back included; since start."""
         return self._latency.snapshot()
 
     def state(self) -> dict[str, Any]:
@@ -146,7 +153,7 @@ class RigConsole:
                 self._scene.alarm(frozenset(camera.camera for camera in status.drift.status.moved))
             recent = self._recent_latency.update({_LATENCY: self._latency.snapshot()}, rig_time_ns())
             moment = Moment(
-                place=self._rig.place,
+                place=self._place,
                 ended=self._rig.ended,
                 status=status,
                 hellos=self._rig.hellos,

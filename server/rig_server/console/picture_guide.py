@@ -66,4 +66,4 @@ def _tints(models: Mapping[int, CameraModel], poses: Mapping[int, Pose]) -> dict
 
 def _bgr(hue_deg: int) -> ImageU8:
     pixel = np.array([[[hue_deg // 2, 210, 255]]], np.uint8)
-    return np.asarray(cv2.cvtColor(pixel, cv2.COLOR_HSV2BGR), np.uint8)[0, 0]
+    return np.asarray(cv2.cvtColor(pixel, cv2.COLOR_HSV2BGR)[0, 0], np.uint8)

@@ -2,8 +2,10 @@
 
 import contextlib
 import hmac
+import logging
 import math
 import secrets
+import threading
 from collections.abc import Iterator, Mapping
 from typing import Any
 
@@ -19,19 +21,23 @@ from rig_calib.rig_calibration import RigCalibration
 from rig_protocol.camera import CameraModel
 from rig_protocol.poses import Pose
 
-SECRET_HEADER = "X-Rig-Scene"
+GUARD_HEADER = "X-Rig-Scene"
 _FRUSTUM_M = 0.12
-_POINT_M = 0.012
+_POINT_M = 0.014
 _CALM_RGB, _ALARM_RGB = (96, 140, 190), (214, 64, 52)
 _MAX_MESSAGE_BYTES = 1 << 20  # of what a page sends
 
+_port_log = logging.getLogger(f"{__name__}.port")
+_port_log.setLevel(logging.ERROR)  # connections are no news
+
 
 class Scene:
-    """viser on a free loopback port that answers only who knows `secret`. Any one thread at a time may draw."""
+    """viser on a free loopback port that answers only who knows `secret`; any thread may draw."""
 
     def __init__(self, most_points: int) -> None:
         self.secret = secrets.token_urlsafe(24)
         self._most_points = most_points
+        self._drawing = threading.Lock()  # guards what follows
         self._jitter = np.random.default_rng(0).random(most_points)
         self._cloud: viser.PointCloudHandle | None = None
         self._frustums: dict[int, viser.CameraFrustumHandle] = {}
@@ -51,7 +57,7 @@ class Scene:
 
     def place(self, calibration: RigCalibration | None, models: Mapping[int, CameraModel]) -> None:
         """Draw the cameras of a calibration instead of what was there."""
-        with self._server.atomic():
+        with self._drawing, self._server.atomic():
             self._clear()
             if calibration is None or not calibration.poses:
                 return
@@ -73,21 +79,22 @@ class Scene:
 
     def alarm(self, camera_ids: frozenset[int]) -> None:
         """Have these cameras stand out."""
-        for camera_id, frustum in self._frustums.items():
-            color = _ALARM_RGB if camera_id in camera_ids else _CALM_RGB
-            if tuple(np.asarray(frustum.color).tolist()) != color:
-                frustum.color = color
+        with self._drawing:
+            for camera_id, frustum in self._frustums.items():
+                color = _ALARM_RGB if camera_id in camera_ids else _CALM_RGB
+                if tuple(np.asarray(frustum.color).tolist()) != color:
+                    frustum.color = color
 
     def show(self, fused: FusedFrame) -> None:
         """Draw a cloud, thinned evenly to the most points that a page is sent; copies what it needs."""
         points, colors = self._thinned(fused)
-        if self._cloud is None:
-            self._cloud = self._server.scene.add_point_cloud(
-                "/cloud", points, colors, point_size=_POINT_M, point_shape="rounded", point_shading="flat"
-            )
-            return
-        with self._server.atomic():
-            self._cloud.points, self._cloud.colors = points, colors
+        with self._drawing, self._server.atomic():
+            if self._cloud is None:
+                self._cloud = self._server.scene.add_point_cloud(
+                    "/cloud", points, colors, point_size=_POINT_M, point_shape="rounded", point_shading="flat"
+                )
+            else:
+                self._cloud.points, self._cloud.colors = points, colors
 
     def _thinned(self, fused: FusedFrame) -> tuple[Any, Any]:
         count = len(fused.points_m)
@@ -109,7 +116,7 @@ class Scene:
     def _look_from(self, T_rig_view: Pose) -> None:
         """From behind and above, down on the rig."""
         up, centre = T_rig_view[:3, 2], T_rig_view[:3, 3]
-        eye = T_rig_view @ np.array([-3.4, -3.0, 3.6, 1.0])
+        eye = T_rig_view @ np.array([-2.3, -1.9, 2.6, 1.0])
         self._server.scene.set_up_direction(up)
         camera = self._server.initial_camera
         camera.up, camera.look_at, camera.position = up, centre, eye[:3]
@@ -127,12 +134,12 @@ def _guarded(secret: str) -> Iterator[None]:
 
     def guarded_serve(handler: Any, host: str, port: int, *, process_request: Any, **options: Any) -> Any:
         def answer(connection: websockets.asyncio.server.ServerConnection, request: Any) -> Any:
-            told = request.headers.get_all(SECRET_HEADER)
+            told = request.headers.get_all(GUARD_HEADER)
             if len(told) != 1 or not hmac.compare_digest(told[0].encode("utf-8", "replace"), expected):
                 return connection.respond(403, "this port serves the console alone\n")
             return process_request(connection, request)
 
-        options["max_size"] = _MAX_MESSAGE_BYTES
+        options |= {"max_size": _MAX_MESSAGE_BYTES, "logger": _port_log}
         return serve(handler, host, port, process_request=answer, **options)
 
     websockets.asyncio.server.serve = guarded_serve  # type: ignore[assignment, misc]

@@ -6,11 +6,9 @@ import contextlib
 import aiohttp
 from aiohttp import web
 
-from rig_server.console.scene import SECRET_HEADER
+from rig_server.console.scene import GUARD_HEADER
 
 PATH = "/scene"
-_PASSED_ON = ("Accept-Encoding",)
-_PASSED_BACK = ("Content-Type", "Content-Encoding")
 _MAX_FROM_PAGE = 1 << 20  # bytes of one message
 _MAX_FROM_SCENE = 64 << 20
 # viser's page is one file with its scripts in it, which make code and workers as they run.
@@ -18,7 +16,8 @@ _POLICY = (
     "default-src 'self' 'unsafe-inline' 'unsafe-eval' blob: data:; "
     "connect-src 'self' ws: wss: blob: data:; frame-ancestors 'self'"
 )
-_HIDE_PANEL = b"<style>body{overflow:hidden}</style>"
+# Of its controls the console needs none: what neither is nor holds the canvas goes.
+_CANVAS_ALONE = b"<style>body *:not(canvas):not(:has(canvas)){display:none!important}</style></head>"
 
 
 class SceneProxy:
@@ -26,14 +25,12 @@ class SceneProxy:
 
     def __init__(self, address: str, secret: str) -> None:
         self._base = f"http://{address}"
-        self._headers = {SECRET_HEADER: secret}
+        self._headers = {GUARD_HEADER: secret}
         self._session: aiohttp.ClientSession | None = None
 
     async def open(self) -> None:
         """Begin."""
-        self._session = aiohttp.ClientSession(
-            headers=self._headers, auto_decompress=False, cookie_jar=aiohttp.DummyCookieJar()
-        )
+        self._session = aiohttp.ClientSession(headers=self._headers, cookie_jar=aiohttp.DummyCookieJar())
 
     async def close(self) -> None:
         """End."""
@@ -53,14 +50,15 @@ class SceneProxy:
 
     async def _page(self, session: aiohttp.ClientSession, request: web.Request) -> web.Response:
         path = request.path.removeprefix(PATH) or "/"
-        headers = {name: request.headers[name] for name in _PASSED_ON if name in request.headers}
-        async with session.get(self._base + path, headers=headers) as answer:
-            back = {name: answer.headers[name] for name in _PASSED_BACK if name in answer.headers}
-            return web.Response(
-                status=answer.status,
-                body=await answer.read(),
-                headers={**back, "Content-Security-Policy": _POLICY},
-            )
+        async with session.get(self._base + path) as answer:
+            body = await answer.read()
+            kind = answer.headers.get("Content-Type", "application/octet-stream")
+            headers = {"Content-Type": kind, "Content-Security-Policy": _POLICY}
+            if kind.startswith("text/html"):
+                body = body.replace(b"</head>", _CANVAS_ALONE, 1)
+            back = web.Response(status=answer.status, body=body, headers=headers)
+            back.enable_compression()
+            return back
 
     async def _socket(self, session: aiohttp.ClientSession, request: web.Request) -> web.WebSocketResponse:
         wanted = request.headers.get("Sec-WebSocket-Protocol", "")

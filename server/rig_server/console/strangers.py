@@ -6,7 +6,8 @@ from collections.abc import Callable
 from aiohttp import web
 
 _MAX_STRANGERS = 32
-_MAX_CONNECTIONS = 256  # of those that brought the token
+_MAX_KNOWN = 256  # connections that brought the token
+_SETTLED_S = 0.1  # a burst of connections is accepted before any of them has its transport
 
 
 class Doorkeeper:
@@ -14,39 +15,44 @@ class Doorkeeper:
 
     def __init__(self, server: Callable[[], asyncio.BaseProtocol]) -> None:
         self._server = server
-        self._strangers: dict[asyncio.BaseProtocol, None] = {}  # oldest first
-        self._known: dict[asyncio.BaseProtocol, None] = {}
+        self._strangers, self._known = _Queue(_MAX_STRANGERS), _Queue(_MAX_KNOWN)
 
     def __call__(self) -> asyncio.BaseProtocol:
         """The protocol of a new connection."""
-        _make_room(self._strangers, _MAX_STRANGERS)
         protocol = self._server()
-        self._strangers[protocol] = None
+        self._strangers.add(protocol)
         return protocol
 
     def admit(self, request: web.Request) -> None:
         """The request brought the token: its connection is no stranger's any more."""
-        protocol = request.protocol
-        if self._strangers.pop(protocol, self) is None:
-            _make_room(self._known, _MAX_CONNECTIONS)
-            self._known[protocol] = None
+        if self._strangers.remove(request.protocol):
+            self._known.add(request.protocol)
 
 
-def _make_room(connections: dict[asyncio.BaseProtocol, None], most: int) -> None:
-    """Forget those that have ended; where that is not enough, hang up on the oldest."""
-    if len(connections) < most:
-        return
-    for protocol in [one for one in connections if _transport(one) is None]:
-        del connections[protocol]
-    while len(connections) >= most:
-        oldest = next(iter(connections))
-        del connections[oldest]
-        transport = _transport(oldest)
-        if transport is not None:
-            transport.abort()
+class _Queue:
+    """Connections, oldest first, and whether each has begun: its transport comes a moment after it."""
 
+    def __init__(self, most: int) -> None:
+        self._most = most
+        self._begun: dict[asyncio.BaseProtocol, bool] = {}
 
-def _transport(protocol: asyncio.BaseProtocol) -> asyncio.Transport | None:
-    """None for a connection that has ended (or not quite begun)."""
-    transport = getattr(protocol, "transport", None)
-    return transport if isinstance(transport, asyncio.Transport) else None
+    def add(self, protocol: asyncio.BaseProtocol) -> None:
+        """One more; where there are too many, hang up on the oldest."""
+        self._begun[protocol] = False
+        if len(self._begun) > self._most:
+            asyncio.get_running_loop().call_later(_SETTLED_S, self._shorten)
+
+    def _shorten(self) -> None:
+        for one, begun in list(self._begun.items()):
+            transport = getattr(one, "transport", None)
+            if transport is None and begun:  # it has ended
+                del self._begun[one]
+            elif isinstance(transport, asyncio.Transport):
+                self._begun[one] = True
+                if len(self._begun) > self._most:
+                    del self._begun[one]
+                    transport.abort()
+
+    def remove(self, protocol: asyncio.BaseProtocol) -> bool:
+        """Whether it was there."""
+        return self._begun.pop(protocol, None) is not None

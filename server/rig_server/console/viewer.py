@@ -74,7 +74,7 @@ class Viewer:
 
 
 def tiles_message(number: int, look: Look, tiles: Sequence[Tile]) -> bytes:
-    """A binary message: length of the header (u32, little-endian), header (JSON), the JPEG files in its order."""
+    """A binary message: length of the header (u32, little-endian), header (JSON), JPEG files in its order."""
     header = {
         "kind": "tiles",
         "number": number,

@@ -32,7 +32,8 @@ _MAX_BODY_BYTES, _MAX_WORD_BYTES = 4096, 1024
 _TYPES = {"html": "text/html", "css": "text/css", "js": "text/javascript", "svg": "image/svg+xml"}
 _HEADERS = {
     "Content-Security-Policy": (
-        "default-src 'none'; script-src 'self'; style-src 'self' 'unsafe-inline'; img-src 'self' blob: data:; "
+        "default-src 'none'; script-src 'self'; style-src 'self' 'unsafe-inline'; "
+        "img-src 'self' blob: data:; "
         "connect-src 'self'; frame-src 'self'; form-action 'self'; base-uri 'none'; frame-ancestors 'none'"
     ),
     "Cache-Control": "no-store",
@@ -161,7 +162,7 @@ class WebServer:
             await runner.cleanup()
 
     def _app(self) -> web.Application:
-        app = web.Application(middlewares=[web.middleware(self._guard)], client_max_size=_MAX_BODY_BYTES)
+        app = web.Application(middlewares=[self._guard], client_max_size=_MAX_BODY_BYTES)
         app.router.add_get("/", self._index)
         app.router.add_get("/page/{name}", self._file)
         app.router.add_get("/live", self._live)
@@ -184,6 +185,7 @@ class WebServer:
     async def _hang_up(self, _: web.Application) -> None:
         await asyncio.gather(*(viewer.close() for viewer in self._viewers), return_exceptions=True)
 
+    @web.middleware
     async def _guard(self, request: web.Request, handler: _Handler) -> web.StreamResponse:
         """Let in who has the token; strangers get a page that asks for it."""
         response: web.StreamResponse

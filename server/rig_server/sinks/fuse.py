@@ -12,6 +12,8 @@ from rig_protocol.frames import DepthFrame, PanoramicFrame
 from rig_protocol.rig_folder import RigDescription
 from rig_server.latest_only import LatestOnly
 
+_NICENESS = 5  # receiving and decoding come first
+_FULLEST_AGE_S = 1.0
 _MODELS_AGE_S = 2.0  # reading the models may mean reading files
 
 
@@ -46,12 +48,13 @@ class FuseSink:
         """`calibration`: the one in force, None where there is none; asked for before every set."""
         self._calibration, self._description, self._listener = calibration, description, listener
         self._settings = settings or LiveFusionSettings()
-        self._worker = LatestOnly[PanoramicFrame]("live fusion", self._take, every_s)
+        self._worker = LatestOnly[PanoramicFrame]("live fusion", self._take, every_s, _NICENESS)
         self._fusion: LiveFusion | None = None
         self._made_of: tuple[RigCalibration, DepthFrame] | None = None
         self._models: dict[int, CameraModel] = {}
         self._models_s = float("-inf")
         self._report = FusionReport()
+        self._fullest, self._fullest_s = 0, float("-inf")
 
     def report(self) -> FusionReport:
         """How it goes; any thread may ask."""
@@ -68,8 +71,11 @@ class FuseSink:
         self._close_fusion()
 
     def offer(self, panorama: PanoramicFrame) -> None:
-        """Fuse this next."""
-        self._worker.offer(panorama)
+        """Fuse this next, unless a set of more cameras has just come: cloud and panorama would flicker."""
+        present, now_s = len(panorama.frames) - len(panorama.missing), time.monotonic()
+        if present >= self._fullest or now_s - self._fullest_s > _FULLEST_AGE_S:
+            self._fullest, self._fullest_s = present, now_s
+            self._worker.offer(panorama)
 
     def _take(self, panorama: PanoramicFrame) -> None:
         calibration = self._calibration()
@@ -96,11 +102,11 @@ class FuseSink:
         if same and _alike(models, self._models):
             return
         self._close_fusion()
-        self._made_of, self._models = made_of, models
         try:
             self._fusion = LiveFusion(calibration, models, replace(self._settings, depth_frame=made_of[1]))
-        except DataError as error:
+        except DataError as error:  # until something changes
             self._report = replace(self._report, trouble=str(error), skipped=())
+        self._made_of, self._models = made_of, models
 
     def _newest_models(self) -> dict[int, CameraModel]:
         if self._made_of is not None and time.monotonic() - self._models_s < _MODELS_AGE_S:

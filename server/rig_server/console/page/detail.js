@@ -57,7 +57,8 @@ export class Detail {
     const gone = isGone(camera);
     byId("detail-away").hidden = !gone;
     byId("detail-away").textContent = gone ? awaySince(camera.away_s) : "";
-    const facts = FACTS.map((name, k) => [TITLES[k], told(name, state.health[name]?.[camera.id])]);
+    const measured = FACTS.map((name, k) => [TITLES[k], told(name, state.health[name]?.[camera.id])]);
+    const facts = measured.filter(([, value]) => value !== "–");
     facts.push(["frames", String(camera.frames)], ["lost", String(camera.lost)]);
     facts.push(["damaged", String(camera.damaged)], ["resent fragments", String(camera.resent)]);
     if (camera.serial) facts.push(["serial", camera.serial]);

@@ -82,6 +82,8 @@ export class Health {
     }
     shown.forEach((quantity, k) => {
       const figure = box.children[k];
+      figure.hidden = !this.#known(quantity);
+      if (figure.hidden) return;
       figure.querySelector("b").textContent = told(quantity, state.health[quantity]?.rig);
       draw(figure.querySelector("canvas"), this.#values(quantity, "rig"), TOLD[quantity]);
     });

@@ -60,6 +60,7 @@ export class Tiles {
   #make(cameras) {
     this.#tiles.clear();
     const grid = byId("tiles");
+    grid.style.setProperty("--across", across(cameras.length));
     grid.querySelectorAll(".tile").forEach((old) => old.remove());
     for (const camera of cameras) {
       const button = element("button", "", "tile");
@@ -97,6 +98,11 @@ export class Tiles {
     waiting.push(() => this.#live.painted(message.number));
     painted.port2.postMessage(0);
   }
+}
+
+// Columns of a wide page, so that the last row is as full as can be.
+function across(count) {
+  return count <= 5 ? Math.max(count, 3) : Math.ceil(count / 2) <= 6 ? Math.ceil(count / 2) : 8;
 }
 
 export function isGone(camera) {
