@@ -121,3 +121,11 @@ def test_a_missing_camera_is_named(bench: Bench) -> None:
     bench.fuse(lacking)
     assert bench.skipped == [("camera 1: left out, it delivered nothing",)]
     assert bench.sink.report().skipped == bench.skipped[0]
+
+
+def test_a_set_that_lacks_cameras_gives_way_to_a_full_one_of_the_same_second(bench: Bench) -> None:
+    lacking = replace(PANORAMA, frames={**PANORAMA.frames, 1: None})
+    bench.fuse()
+    bench.sink.offer(lacking)
+    bench.fuse()
+    assert bench.skipped == [(), ()]
