@@ -10,7 +10,7 @@ from aiohttp import WSCloseCode, web
 
 from rig_server.console.tiles import Look, Tile, TileRound
 
-_MAX_UNPAINTED = 2  # messages; a page that paints slower than sets come skips some
+_MAX_UNPAINTED = 1  # messages: a second one would wait for the first to be painted, and show an older set
 
 
 class Viewer:
