@@ -148,7 +148,7 @@ class ConsoleSettings(Settings):
     """How often a second the cameras' pictures are sent to pages that look."""
     fused_hz: float = Field(4.0, gt=0, le=30)
     """How often a second sets are fused for cloud and panorama, while a page looks: some 100 ms of a core."""
-    cloud_points: int = Field(60_000, ge=100, le=2_000_000)
+    cloud_points: int = Field(80_000, ge=100, le=2_000_000)
     """Points of the cloud that pages are sent, thinned evenly; a point takes 9 bytes."""
     folder: Path = Path("calibration")
     """Where an accepted calibration is written, and where a live rig's console finds that of last time."""

@@ -33,7 +33,10 @@ export class Detail {
 
   open(id) {
     this.id = id;
-    if (!this.#dialog.open) this.#dialog.showModal();
+    if (!this.#dialog.open) {
+      this.#dialog.showModal();
+      this.#dialog.focus();
+    }
     this.#changed();
     if (this.#state) this.show(this.#state);
   }

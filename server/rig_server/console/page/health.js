@@ -7,7 +7,7 @@ const MOST = 600; // samples
 // How a quantity is told: digits, the factor, the unit, from where on it is a trouble.
 const TOLD = {
   fps: { title: "frames/s", digits: 1, least: 0, most: 30 },
-  loss: { title: "lost", digits: 2, factor: 100, unit: " %", least: 0, most: 0.01, high: 0.001 },
+  loss: { title: "lost", digits: 2, factor: 100, unit: " %", least: 0, most: 0.05, high: 0.01 },
   damaged: { title: "damaged/s", digits: 1, least: 0, most: 1, high: 0.5 },
   temperature_c: { title: "temperature", digits: 0, unit: " °C", high: 80 },
   clock_error_us: { title: "clock", digits: 0, unit: " µs", least: 0, high: 500 },

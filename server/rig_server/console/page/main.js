@@ -103,7 +103,11 @@ for (const button of document.querySelectorAll("[data-mode]")) {
   button.addEventListener("click", () => setMode(button.dataset.mode));
 }
 document.addEventListener("visibilitychange", look);
-byId("open-help").addEventListener("click", () => byId("help").showModal());
+function showHelp() {
+  byId("help").showModal();
+  byId("help").focus();
+}
+byId("open-help").addEventListener("click", showHelp);
 
 function toggleRecording() {
   return order(byId("record").classList.contains("on") ? "stop-recording" : "start-recording");
@@ -136,7 +140,7 @@ new Keys([
   ["y", "accept the calibration", on("y"), () => press("accept")],
   ["n", "reject it", on("n"), () => press("reject")],
   ["r", "record, or stop", on("r"), () => press("record")],
-  ["?", "this help", on("?"), () => (byId("help").open ? byId("help").close() : byId("help").showModal())],
+  ["?", "this help", on("?"), () => (byId("help").open ? byId("help").close() : showHelp())],
 ]);
 
 look();
