@@ -9,7 +9,7 @@ from rich.console import Console
 
 from rig_calib.outputs import NAME
 from rig_calib.rig_calibration import RigCalibration
-from rig_protocol.errors import ConfigurationError
+from rig_protocol.errors import ConfigurationError, DataError
 from rig_server.announcement import announced
 from rig_server.capture_log import CaptureLog
 from rig_server.config import RigSettings
@@ -82,5 +82,5 @@ def _take_up_calibration(rig: Rig) -> None:
     if rig.calibration is None and file.is_file():
         try:
             rig.put_in_force(RigCalibration.load(file))
-        except (ConfigurationError, ValueError) as error:
+        except DataError as error:
             raise ConfigurationError(f"console.folder: {error}") from error

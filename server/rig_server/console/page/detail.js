@@ -1,22 +1,24 @@
 // One camera, enlarged: its full picture, its figures, and what it can be told.
 
 import { paint } from "./live.js";
-import { told } from "./health.js";
+import { TOLD, told } from "./health.js";
 import { onPress, order } from "./orders.js";
+import { draw } from "./plot.js";
 import { isGone } from "./tiles.js";
 import { awaySince, byId, element } from "./words.js";
 
-const FACTS = ["fps", "loss", "temperature_c", "clock_error_us", "drift_mm", "drift_deg"];
-const TITLES = ["frames/s", "lost now", "temperature", "clock", "moved", "turned"];
+const PLOTS = ["fps", "loss", "temperature_c", "clock_error_us", "drift_mm"];
 
 export class Detail {
   id = null;
   #state = null;
   #changed;
+  #health;
   #dialog = byId("detail");
 
-  constructor(changed) {
+  constructor(changed, health) {
     this.#changed = changed;
+    this.#health = health;
     onPress("identify", () => order("identify", { camera: this.id }));
     onPress("expose-auto", () => order("expose", { camera: this.id, auto: true }));
     onPress("expose-fixed", () => order("expose", { camera: this.id, auto: false }));
@@ -60,9 +62,7 @@ export class Detail {
     const gone = isGone(camera);
     byId("detail-away").hidden = !gone;
     byId("detail-away").textContent = gone ? awaySince(camera.away_s) : "";
-    const measured = FACTS.map((name, k) => [TITLES[k], told(name, state.health[name]?.[camera.id])]);
-    const facts = measured.filter(([, value]) => value !== "–");
-    facts.push(["frames", String(camera.frames)], ["lost", String(camera.lost)]);
+    const facts = [["frames", String(camera.frames)], ["lost", String(camera.lost)]];
     facts.push(["damaged", String(camera.damaged)], ["resent fragments", String(camera.resent)]);
     if (camera.serial) facts.push(["serial", camera.serial]);
     if (camera.port_path) facts.push(["USB port", camera.port_path]);
@@ -75,8 +75,30 @@ export class Detail {
         return pair;
       }),
     );
+    this.#plot(state, camera.id);
     for (const id of ["identify", "expose-auto", "expose-fixed", "calibrate-one"]) {
       byId(id).hidden = !state.orders || (id === "calibrate-one" && !state.calibration);
     }
+  }
+
+  #plot(state, id) {
+    const box = byId("detail-plots");
+    const known = PLOTS.filter((name) => this.#health.values(name, id).some((value) => value !== null));
+    if (box.dataset.key !== known.join()) {
+      box.dataset.key = known.join();
+      box.replaceChildren(
+        ...known.map((name) => {
+          const figure = element("figure", "", "plot");
+          const caption = element("figcaption");
+          caption.append(element("span", TOLD[name].title), element("b"));
+          figure.append(caption, element("canvas"));
+          return figure;
+        }),
+      );
+    }
+    known.forEach((name, k) => {
+      box.children[k].querySelector("b").textContent = told(name, state.health[name]?.[id]);
+      draw(box.children[k].querySelector("canvas"), this.#health.values(name, id), TOLD[name]);
+    });
   }
 }

@@ -1,11 +1,11 @@
 // Every camera's health as a table of small plots, and the rig's as larger ones.
 
 import { draw } from "./plot.js";
-import { byId, element, number } from "./words.js";
+import { byId, clock, element, number } from "./words.js";
 
 const MOST = 600; // samples
 // How a quantity is told: digits, the factor, the unit, from where on it is a trouble.
-const TOLD = {
+export const TOLD = {
   fps: { title: "frames/s", digits: 1, least: 0, most: 30 },
   loss: { title: "lost", digits: 2, factor: 100, unit: " %", least: 0, most: 0.05, high: 0.01 },
   damaged: { title: "damaged/s", digits: 1, least: 0, most: 1, high: 0.5 },
@@ -42,6 +42,7 @@ export class Health {
     }
     if (now - this.#drawn_ms < 950) return;
     this.#drawn_ms = now;
+    byId("health-told").textContent = `last ${clock(this.values("sets_per_s", "rig").length)}`;
     this.#plots(state);
     this.#table(state);
   }
@@ -59,7 +60,7 @@ export class Health {
     }
   }
 
-  #values(quantity, place) {
+  values(quantity, place) {
     return this.#series.get(quantity)?.get(String(place)) ?? [];
   }
 
@@ -85,7 +86,7 @@ export class Health {
       figure.hidden = !this.#known(quantity);
       if (figure.hidden) return;
       figure.querySelector("b").textContent = told(quantity, state.health[quantity]?.rig);
-      draw(figure.querySelector("canvas"), this.#values(quantity, "rig"), TOLD[quantity]);
+      draw(figure.querySelector("canvas"), this.values(quantity, "rig"), TOLD[quantity]);
     });
   }
 
@@ -109,7 +110,7 @@ export class Health {
         const high = (value ?? 0) >= (TOLD[quantity].high ?? Infinity);
         cell.classList.toggle("high", high);
         const options = { ...TOLD[quantity], color: high ? "--bad" : "--accent" };
-        draw(cell.querySelector("canvas"), this.#values(quantity, camera.id), options);
+        draw(cell.querySelector("canvas"), this.values(quantity, camera.id), options);
       });
     });
   }

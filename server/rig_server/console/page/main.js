@@ -11,7 +11,7 @@ import { byId, clock, list, number } from "./words.js";
 
 const live = new Live();
 const health = new Health();
-const detail = new Detail(look);
+const detail = new Detail(look, health);
 const tiles = new Tiles(live, (id) => detail.open(id));
 const calibration = new Calibration();
 let mode = "color";
