@@ -41,7 +41,7 @@ soak-agents: $(READY)  ## agents killed every few seconds, for ten minutes, into
 	$(BIN)/python tests/benchmarks/agent_soak.py $(or $(SOAK_MINUTES),10)
 
 fuzz: $(VENV)/.ready-fuzz  ## every parser of strangers' bytes, 100 s each: FUZZ_SECONDS=100
-	for target in server_link agent_link bodies units codecs key_files; do \
+	for target in server_link agent_link bodies units codecs key_files recordings; do \
 	    $(BIN)/python tests/fuzz/fuzz_parsers.py $$target -max_total_time=$(or $(FUZZ_SECONDS),100) || exit 1; \
 	done
 

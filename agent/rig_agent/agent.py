@@ -1,7 +1,8 @@
-"""The agent: source → encoder → link → pacer → transport.
+"""The agent: source → encoder → link → pacer → transport, and → recorder.
 
 Three threads, so that nothing holds up the camera: capture reads frames, the encoder packs them, the
-network loop (the caller's thread) sends them. Between them stand queues that drop the oldest frame.
+network loop (the caller's thread) sends them. Between them stand queues that drop the oldest frame. A fourth
+writes the take, where one is recorded: every frame, whatever the server wants.
 """
 
 import logging
@@ -10,16 +11,17 @@ import select
 import threading
 import time
 from collections.abc import Callable
-from dataclasses import fields, replace
+from dataclasses import dataclass, fields, replace
 
 from rig_agent.capture import Capture
 from rig_agent.config import AgentSettings
-from rig_agent.encoder import encode_frame, fits
+from rig_agent.encoder import codecs_to_keep, encode_frame, fits
 from rig_agent.frame_queue import FrameQueue
 from rig_agent.health import HealthLog, Totals, gauges
 from rig_agent.hello import make_hello
 from rig_agent.remote_control import RemoteControl
 from rig_agent.sources.base import FrameSource, SourceDescription
+from rig_agent.take_recording import TakeRecording
 from rig_agent.transport import now_ns
 from rig_agent.unix_socket import send_to_unix_socket
 from rig_agent.uplink import Uplink, Wanted
@@ -36,6 +38,7 @@ from rig_protocol.troubleshooting import Topic, see
 _log = logging.getLogger(__name__)
 
 _QUEUE_FRAMES = 2  # covers one hiccup of the next stage; older frames are stale
+_RECORDED_QUEUE_FRAMES = 16  # of those that are recorded none is: half a second, 15 MB
 _GAUGES_INTERVAL_NS = 1_000_000_000
 _TICK_S = 0.2  # how soon a thread notices that it should end
 _HUNG_NS = 60_000_000_000  # a driver call that takes longer will not return
@@ -43,22 +46,40 @@ _LONGEST_TURN_NS = 1_000_000_000
 _STOP_TIMEOUT_S = 5.0  # closing a Kinect takes a few seconds at most
 
 
+@dataclass(frozen=True, slots=True)
+class _Shot:
+    """A captured frame; `number` counts all of them, the frame's own sequence those that are `wanted`."""
+
+    frame: RgbdFrame
+    number: int
+    wanted: bool
+
+
 class Agent:
-    """Streams one camera to one server until it is told to stop, whatever fails in between."""
+    """Streams one camera to one server until it is told to stop, come what may, and may record it."""
 
     def __init__(
-        self, settings: AgentSettings, rig_key: RigKey, open_source: Callable[[], FrameSource]
+        self, settings: AgentSettings, rig_key: RigKey | None, open_source: Callable[[], FrameSource]
     ) -> None:
-        """Nothing runs before `run`."""
+        """Nothing runs before `run`. Without a key there is no server: it only records.
+
+        ConfigurationError where the settings say to record and that is not possible.
+        """
         self._settings = settings
-        self._captured: FrameQueue[RgbdFrame] = FrameQueue(_QUEUE_FRAMES)
+        path = settings.record.path
+        self._take = None if path is None else TakeRecording(settings, path)
+        self._captured: FrameQueue[_Shot] = FrameQueue(
+            _QUEUE_FRAMES if self._take is None else _RECORDED_QUEUE_FRAMES
+        )
+        self._left_out = 0  # captured frames that the server does not want
         self._encoded: FrameQueue[EncodedFrame] = FrameQueue(_QUEUE_FRAMES)
         self._capture = Capture(
-            open_source, settings.fps, self._source_opened, self._captured.put, self._fail
+            open_source, settings.fps, self._source_opened, self._take_frame, self._fail, self._leave_out
         )
         self._remote = RemoteControl(self._capture, self._wake_up)
         self._encoder = threading.Thread(target=self._encode_frames, name="encoder", daemon=True)
-        self._uplink = Uplink(settings, rig_key, SystemClock(now_ns, time.time_ns).read)
+        self._has_server = rig_key is not None
+        self._uplink = Uplink(settings, rig_key or RigKey.INSECURE, SystemClock(now_ns, time.time_ns).read)
         self._service_manager = ServiceManager(send_to_unix_socket)
         self._hello: Hello | None = None  # of the source that is open now
         self._introduced: Hello | None = None
@@ -85,6 +106,7 @@ class Agent:
             source_losses=capture.losses,
             network_errors=uplink.network_errors,
             source=self._capture.source_counters,
+            recording=None if self._take is None else self._take.status(),
         )
 
     def run(self) -> None:
@@ -92,6 +114,8 @@ class Agent:
 
         Either way the server is told goodbye and the source is closed.
         """
+        if self._take is not None:
+            self._take.start()
         self._capture.start()
         self._encoder.start()
         try:
@@ -142,7 +166,7 @@ class Agent:
 
     def _forward(self, time_ns: int) -> None:
         hello = self._hello
-        if hello is not None and hello is not self._introduced:
+        if self._has_server and hello is not None and hello is not self._introduced:
             self._introduced = hello
             self._uplink.introduce(hello, time_ns)
         self._uplink.report_gravity(self._capture.gravity)
@@ -155,6 +179,8 @@ class Agent:
                 self._remote.take(news, time_ns)
             else:
                 self._remote.session_ended()
+        if self._take is not None:
+            self._take.rig_tie = self._uplink.rig_tie
         self._wanted = self._uplink.wanted
         if self._wanted is not None:
             self._capture.want(self._wanted.fps, self._wanted.rig_offset_ns)
@@ -173,6 +199,8 @@ class Agent:
                 extra=see(Topic.HANGING_KINECT),
             )
         self._encoder.join()
+        if self._take is not None:
+            self._take.stop()
         if ended:
             os.close(self._wake)
 
@@ -181,21 +209,51 @@ class Agent:
     def _encode_frames(self) -> None:
         try:
             while not self._stopping.is_set():
-                frame, wanted = self._captured.get(_TICK_S), self._wanted
-                if frame is None:
+                shot, wanted = self._captured.get(_TICK_S), self._wanted
+                if shot is None:
                     continue
-                if wanted is None or not fits(frame, wanted.color_codec, wanted.depth_codec):
-                    self._unheard += 1  # nobody listens, or not yet to a camera that was switched
-                    continue
-                named = replace(frame, camera_id=wanted.camera_id)
-                self._encoded.put(encode_frame(named, wanted.color_codec, wanted.depth_codec))
-                self._wake_up()
+                kept = self._record(shot)
+                if shot.wanted and self._settings.streams:
+                    self._encode_to_send(shot.frame, wanted, kept)
         except Exception as error:  # the thread's boundary: `run` raises it
             self._fail(error)
 
+    def _record(self, shot: _Shot) -> EncodedFrame | None:
+        """Give a frame to the recorder, lossless; what it was encoded to."""
+        if self._take is None:
+            return None
+        color, depth = codecs_to_keep(shot.frame, self._settings.color, self._settings.depth)
+        encoded = encode_frame(shot.frame, color, depth)
+        self._take.add(replace(encoded, sequence=shot.number, gravity=shot.frame.gravity))
+        return encoded
+
+    def _encode_to_send(self, frame: RgbdFrame, wanted: Wanted | None, kept: EncodedFrame | None) -> None:
+        if wanted is None or not fits(frame, wanted.color_codec, wanted.depth_codec):
+            self._unheard += 1  # nobody listens, or not yet to a camera that was switched
+            return
+        named = replace(frame, camera_id=wanted.camera_id)
+        self._encoded.put(encode_frame(named, wanted.color_codec, wanted.depth_codec, kept))
+        self._wake_up()
+
+    def _take_frame(self, frame: RgbdFrame) -> None:
+        self._enqueue(_Shot(frame, frame.sequence + self._left_out, wanted=True))
+
+    def _leave_out(self, frame: RgbdFrame) -> None:
+        """The server does not want this one; a recording does."""
+        if self._take is not None:
+            self._enqueue(_Shot(frame, frame.sequence + self._left_out, wanted=False))
+        self._left_out += 1
+
+    def _enqueue(self, shot: _Shot) -> None:
+        dropped = self._captured.put(shot)
+        if dropped is not None and self._take is not None:
+            self._take.add_dropped(dropped.frame.timestamp_ns)
+
     def _source_opened(self, description: SourceDescription) -> None:
         """A device that came back as it was keeps its session; another one says hello anew."""
-        hello = make_hello(self._settings, description)
+        if self._take is not None:
+            self._take.describe(description)
+        hello = make_hello(self._settings, description, self._settings.streams)
         if self._hello is None or not _same(hello, self._hello):
             self._hello = hello
             self._wake_up()

@@ -38,8 +38,8 @@ class CaptureCounters:
 class Capture:
     """Runs one source after another: open, read until it is lost, wait, open again.
 
-    `on_open` and `on_frame` are called on the capture thread and must not wait. `on_failure` gets what no
-    new attempt can cure (a torn file, a wrong setting); the thread has then ended.
+    `on_open`, `on_frame` and `on_left_out` are called on the capture thread and must not wait. `on_failure`
+    gets what no new attempt can cure (a torn file, a wrong setting); the thread has then ended.
     """
 
     def __init__(
@@ -49,12 +49,14 @@ class Capture:
         on_open: Callable[[SourceDescription], None],
         on_frame: Callable[[RgbdFrame], None],
         on_failure: Callable[[Exception], None],
+        on_left_out: Callable[[RgbdFrame], None] = lambda _: None,
     ) -> None:
-        """Frames beyond `max_fps` are left out evenly."""
+        """Frames beyond `max_fps` are left out evenly; its count is that of the next one that is not."""
         self._open_source = open_source
         self._max_fps = max_fps
         self._wanted: tuple[float | None, int] = None, 0
         self._on_open, self._on_frame, self._on_failure = on_open, on_frame, on_failure
+        self._on_left_out = on_left_out
         self._controls: deque[tuple[str, ControlValue, Told]] = deque(maxlen=_MAX_CONTROLS)
         self._stopping = threading.Event()
         # A daemon: a driver that hangs must not keep the program from ending.
@@ -126,9 +128,11 @@ class Capture:
                 # A source that was opened again, or whose clock was set back, counts on where it was.
                 if offset is None or frame.sequence + offset < self._next_sequence:
                     offset = self._next_sequence - frame.sequence
+                counted = replace(frame, sequence=frame.sequence + offset)
                 if self._is_wanted(wanted, frame.timestamp_ns, description.fps):
-                    self._deliver(replace(frame, sequence=frame.sequence + offset))
+                    self._deliver(counted)
                 else:  # left out on purpose: no gap in the count, which tells of frames that were lost
+                    self._on_left_out(counted)
                     offset -= 1
 
     def _obey(self, source: FrameSource) -> bool:

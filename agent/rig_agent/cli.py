@@ -1,5 +1,6 @@
 """The program `rig-agent`: streams one camera to the rig server."""
 
+import logging
 import os
 import signal
 import sys
@@ -13,6 +14,9 @@ from rig_protocol.programs import EXIT_FAILED, leave_done, run_program, set_up_l
 
 if TYPE_CHECKING:  # heavy: imported where they are used, so that --help is quick
     from rig_agent.config import AgentSettings
+    from rig_protocol.rig_key import RigKey
+
+_log = logging.getLogger(__name__)
 
 _EXAMPLES = """
 **Examples**
@@ -26,6 +30,10 @@ _EXAMPLES = """
 `rig-agent --source recording --path take.mcap --camera 3` — play camera 3 of a recorded take
 
 `rig-agent --source synthetic --camera 0 --seed 7` — one camera of the simulated ring
+
+`rig-agent --record /var/lib/kinect-rig/takes --camera 3` — record on this Pi, and stream
+
+`rig-agent --record take.mcap --camera 3 --server none` — only record, without any network
 
 `rig-agent still board-01.png` — one image for the calibration of a lens
 
@@ -61,7 +69,8 @@ def run(
         ),
     ] = None,
     server: Annotated[
-        str | None, typer.Option(metavar="HOST[:PORT]", help="Where rig-server listens.")
+        str | None,
+        typer.Option(metavar="HOST[:PORT]", help="Where rig-server listens; none: only --record."),
     ] = None,
     camera: Annotated[
         str | None,
@@ -72,6 +81,10 @@ def run(
     ] = None,
     recording: Annotated[
         Path | None, typer.Option(metavar="FILE", help="The .oni recording to play (source openni2).")
+    ] = None,
+    record: Annotated[
+        Path | None,
+        typer.Option(metavar="FILE.mcap", help="Record every frame here; a folder: a new file in it."),
     ] = None,
     fps: Annotated[float | None, typer.Option(help="Frames a second.")] = None,
     seed: Annotated[int | None, typer.Option(help="Seed of the simulated rig (source synthetic).")] = None,
@@ -113,6 +126,7 @@ def run(
         "source": source,
         "camera": slot,
         "fps": fps,
+        "record": {"path": record},
         "key_file": key_file,
         "insecure": insecure or None,
         "openni2": {"recording": recording},
@@ -196,10 +210,9 @@ def _stream(settings: "AgentSettings") -> None:
     from rig_agent.agent import Agent
     from rig_agent.sources import open_source
     from rig_protocol.codecs import keep_freed_memory
-    from rig_protocol.key_file import rig_key
 
     keep_freed_memory()
-    agent = Agent(settings, rig_key(settings.key_file, settings.insecure), lambda: open_source(settings))
+    agent = Agent(settings, _key(settings), lambda: open_source(settings))
 
     def stop(*_: object) -> None:
         _on_signals(signal.SIG_DFL)  # a second Ctrl-C ends the program without ceremony
@@ -209,6 +222,20 @@ def _stream(settings: "AgentSettings") -> None:
     agent.run()
     if agent.restarts:  # the same process to systemd, or whoever watches over it
         os.execv(sys.executable, [sys.executable, *sys.orig_argv[1:]])  # noqa: S606  # our own command line
+
+
+def _key(settings: "AgentSettings") -> "RigKey | None":
+    """The rig's key; None where there is no server: nobody named one, and without a key none would listen."""
+    from rig_agent.config import AUTO, NOBODY
+    from rig_protocol.key_file import has_key, rig_key
+
+    if settings.server == NOBODY:
+        return None
+    keyless = not settings.insecure and not has_key(settings.key_file)
+    if keyless and settings.server == AUTO and settings.record.path is not None:
+        _log.info("there is no rig key here: recording without a server")
+        return None
+    return rig_key(settings.key_file, settings.insecure)
 
 
 def _check(settings: "AgentSettings", as_json: bool) -> None:

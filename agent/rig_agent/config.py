@@ -3,21 +3,22 @@
 import platform
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, Self
 
-from pydantic import Field, field_validator
+from pydantic import Field, field_validator, model_validator
 
 from rig_agent.simulator.settings import SimulatorSettings
 from rig_agent.sources.freenect import FreenectSettings
 from rig_agent.sources.openni2 import Openni2Settings
 from rig_protocol.datagram import DEFAULT_DATAGRAM_SIZE, MAX_DATAGRAM_SIZE, MIN_DATAGRAM_SIZE
 from rig_protocol.events import Address
+from rig_protocol.recorder import TakeSettings
 from rig_protocol.settings import Settings, load_settings
 
 ENVIRONMENT_PREFIX = "RIG_AGENT_"
 CONFIG_PLACES = (Path("agent.toml"), Path("/etc/kinect-rig/agent.toml"))
 DEFAULT_PORT = 4012
-AUTO = "auto"
+AUTO, NOBODY = "auto", "none"
 
 SourceName = Literal["freenect", "openni2", "folder", "recording", "synthetic"]
 Manner = Literal["lossless", "jpeg", "raw"]
@@ -42,6 +43,17 @@ class RecordingSettings(Settings):
     """Camera of the take, by id or name; unset: the agent's own slot `camera`."""
 
 
+class RecordSettings(TakeSettings):
+    """Recording on this machine's own disk, every frame as the source gives it (docs/recording.md)."""
+
+    path: Path | None = Field(None, examples=[Path("/var/lib/kinect-rig/takes")])
+    """The file to record to, or a folder, where every start begins a new file; unset: none is recorded."""
+    stream: bool = True
+    """Whether frames go to the server, too; false: it hears from this camera, but gets no frames."""
+    queue_mib: int = Field(64, ge=8, le=1 << 20)
+    """Memory for frames that wait for a slow disk; what does not fit is dropped, and told in the file."""
+
+
 class PacingSettings(Settings):
     """How a frame's datagrams are spread in time, so that twelve agents do not overflow one switch port."""
 
@@ -55,7 +67,8 @@ class AgentSettings(Settings):
     """Settings of rig-agent. Remove the # before a key to change it; shown are the defaults."""
 
     server: str = Field(AUTO, examples=["rig-server.local:4012"])
-    """Where rig-server listens: HOST:PORT or HOST; `auto`: where one announces itself by mDNS."""
+    """Where rig-server listens: HOST:PORT or HOST; `auto`: where one announces itself by mDNS;
+    `none`: only record."""
     source: SourceName = "freenect"
     """Where frames come from: a Kinect, any OpenNI2 device or recording, a rig folder or the simulator."""
     camera: int | None = Field(None, ge=0, lt=64, examples=[0])
@@ -78,6 +91,8 @@ class AgentSettings(Settings):
     """Neither authenticate nor keep secret: only for an isolated bench."""
     log_level: Literal["DEBUG", "INFO", "WARNING", "ERROR"] = "INFO"
     """What is worth a line in the log."""
+    record: RecordSettings = RecordSettings()
+    """Recording on this machine's own disk."""
     pacing: PacingSettings = PacingSettings()
     """How frames are spread in time."""
     freenect: FreenectSettings = FreenectSettings()
@@ -94,14 +109,25 @@ class AgentSettings(Settings):
     @field_validator("server")
     @classmethod
     def _server_is_an_address(cls, text: str) -> str:
-        if text != AUTO:
+        if text not in (AUTO, NOBODY):
             _parse_address(text)
         return text
 
+    @model_validator(mode="after")
+    def _has_something_to_do(self) -> Self:
+        if self.server == NOBODY and self.record.path is None:
+            raise ValueError("without a server there must be a file or folder to record to: give --record")
+        return self
+
+    @property
+    def streams(self) -> bool:
+        """Whether frames go to the server."""
+        return self.record.path is None or self.record.stream
+
     @property
     def address(self) -> Address | None:
-        """`server` as (host, port); None where one is to be found."""
-        return None if self.server == AUTO else _parse_address(self.server)
+        """`server` as (host, port); None where one is to be found, or nobody listens."""
+        return None if self.server in (AUTO, NOBODY) else _parse_address(self.server)
 
     def display_name(self, slot: int | None) -> str:
         """The name, or the one that follows from the slot, or from the machine."""

@@ -16,12 +16,14 @@ class FrameQueue(Generic[T]):
         self._changed = threading.Condition()
         self.dropped = 0
 
-    def put(self, item: T) -> None:
-        """Add the newest item, at once."""
+    def put(self, item: T) -> T | None:
+        """Add the newest item, at once; the one that it drops for it."""
         with self._changed:
-            self.dropped += len(self._items) == self._items.maxlen
+            dropped = self._items[0] if len(self._items) == self._items.maxlen else None
+            self.dropped += dropped is not None
             self._items.append(item)
             self._changed.notify()
+            return dropped
 
     def get(self, timeout_s: float = 0.0) -> T | None:
         """Take the oldest item, or None when none came in time."""

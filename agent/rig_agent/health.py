@@ -4,6 +4,8 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from rig_protocol.recorder import RecordingStatus
+
 _PROCESSOR_TEMPERATURE = Path("/sys/class/thermal/thermal_zone0/temp")  # in 1/1000 °C, on a Pi and most PCs
 
 
@@ -31,6 +33,8 @@ class Totals:
     """Sends that the network refused."""
     source: Mapping[str, int] = field(default_factory=dict)
     """What the driver counted, by its own names; what is zero may be left out."""
+    recording: RecordingStatus | None = None
+    """The take on this machine; None where nobody records."""
 
 
 def gauges(totals: Totals) -> dict[str, float]:
@@ -40,6 +44,7 @@ def gauges(totals: Totals) -> dict[str, float]:
         "resent": totals.resent,
         "damaged": totals.damaged,
         "source_losses": totals.source_losses,
+        **_recording_gauges(totals.recording),
         **{f"source_{name}": count for name, count in totals.source.items()},
     }
     try:
@@ -47,6 +52,17 @@ def gauges(totals: Totals) -> dict[str, float]:
     except (OSError, ValueError):
         return found  # this machine does not tell
     return found
+
+
+def _recording_gauges(recording: RecordingStatus | None) -> dict[str, float]:
+    """`recording`: 1 while a take is written, 0 when it has ended by itself."""
+    if recording is None:
+        return {}
+    return {
+        "recording": float(recording.ended is None),
+        "recorded_bytes": recording.bytes,
+        "not_recorded": recording.dropped,
+    }
 
 
 class HealthLog:
@@ -81,4 +97,13 @@ class HealthLog:
             f"{totals.resent} resent, "
             f"{totals.damaged} damaged, {totals.connections} connections, "
             f"{totals.source_losses} device losses, {totals.network_errors} network errors{source}"
+            f"{_recording_words(totals.recording)}"
         )
+
+
+def _recording_words(recording: RecordingStatus | None) -> str:
+    if recording is None:
+        return ""
+    ended = "" if recording.ended is None else f" before it ended: {recording.ended}"
+    megabytes = recording.bytes / 1e6
+    return f"; recorded {recording.frames} ({megabytes:.0f} MB), {recording.dropped} not recorded{ended}"

@@ -18,8 +18,11 @@ _OFFERS: dict[Manner, tuple[Manner, ...]] = {
 }
 
 
-def make_hello(settings: AgentSettings, source: SourceDescription) -> Hello:
-    """The hello of this agent with this source; the operator's slot wins over a recording's."""
+def make_hello(settings: AgentSettings, source: SourceDescription, streams: bool = True) -> Hello:
+    """The hello of this agent with this source; the operator's slot wins over a recording's.
+
+    Without `streams` it offers no frames.
+    """
     slot = source.camera_id if settings.camera is None else settings.camera
     return Hello(
         name=settings.display_name(slot),
@@ -27,8 +30,8 @@ def make_hello(settings: AgentSettings, source: SourceDescription) -> Hello:
         serial=source.serial,
         port_path=source.port_path,
         model=source.model,
-        color_codecs=_offer(source.color_image, settings.color),
-        depth_codecs=_offer(source.depth_image, settings.depth),
+        color_codecs=_offer(source.color_image, settings.color) if streams else (),
+        depth_codecs=_offer(source.depth_image, settings.depth) if streams else (),
         fps=min(source.fps, settings.fps or source.fps),
         software=f"kinect-rig {version('kinect-rig')}",
         ciphers=ciphers_by_speed(),

@@ -16,6 +16,7 @@ from rig_protocol.events import AgentEvent, Connected, ControlRequested, Disconn
 from rig_protocol.frames import EncodedFrame
 from rig_protocol.gravity import Gravity
 from rig_protocol.messages import Hello, StreamPlan, Welcome
+from rig_protocol.recording_format import ClockTie
 from rig_protocol.rig_key import RigKey
 from rig_protocol.system_clock import SystemClockReading
 from rig_protocol.troubleshooting import Topic, see
@@ -87,6 +88,14 @@ class Uplink:
             color, depth = _first(welcome.color_codecs), _first(welcome.depth_codecs)
             return Wanted(welcome.camera_id, color, depth)
         return Wanted(welcome.camera_id, plan.color_codec, plan.depth_codec, plan.fps, plan.offset_ns)
+
+    @property
+    def rig_tie(self) -> ClockTie | None:
+        """The rig clock as the server tells it, while it does."""
+        plan = None if self._link is None else self._link.plan
+        if plan is None or plan.rig_clock is None or plan.offset_uncertainty_ns is None:
+            return None
+        return ClockTie(plan.rig_clock, plan.offset_ns, plan.offset_uncertainty_ns)
 
     @property
     def sent(self) -> int:

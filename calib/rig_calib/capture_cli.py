@@ -157,10 +157,12 @@ def _export_frames(
     from rig_calib.terminal import progress_bar
     from rig_protocol.errors import ConfigurationError
 
-    exporter, capture = FORMATS[form].exporter(), open_capture(path)
+    chosen_format = FORMATS[form]
+    exporter, capture = chosen_format.exporter(), open_capture(path)
     positions = range(*chosen.indices(len(capture.marks)))
     if not positions:
         raise ConfigurationError(f"{path} holds {len(capture.marks)} panoramic frames: none is left")
+    chosen_format.check(out, len(positions))
     known = capture.calibration if calibration is None else RigCalibration.load(calibration)
     with progress_bar(console) as tell, open_workers(workers, scheduler) as hands:
         exported = exporter(

@@ -30,6 +30,8 @@ _EXAMPLES = """
 
 `rig-calib intrinsics board/*.png --board 9x6 --square-mm 25 --out unit.json` — measure one colour camera
 
+`rig-calib merge cam*.mcap --out take.mcap` — what each Pi recorded by itself, as one take
+
 `rig-calib pattern --out patterns` — sheets to print and to hang where neighbours' views overlap
 
 `rig-calib export results/calibration.json --format ros2 --out rig.launch.py` — for other programs
@@ -154,6 +156,30 @@ def check(
         told.append(unknown_message(result.unknown, names))
     if told:
         raise RigError("; ".join(told), Topic.CAMERA_MOVED)
+
+
+@app.command()
+def merge(
+    takes: Annotated[list[Path], typer.Argument(help="Takes of agents or servers: their first files.")],
+    out: Annotated[Path, typer.Option(metavar="FILE.mcap", help="The take to write.")],
+    max_spread_ms: Annotated[
+        float | None, typer.Option(min=0.001, help="Widest exposure spread of a set; else a frame period.")
+    ] = None,
+    as_json: AsJson = False,
+) -> None:
+    """Put the takes of several machines on one clock and into one take, which everything else plays."""
+    from rich.console import Console
+
+    from rig_calib.merged_take import merge_takes
+    from rig_calib.terminal import merge_table, progress_bar
+
+    set_up_logging("WARNING")
+    console = Console(quiet=as_json, highlight=False)
+    with progress_bar(console) as tell:
+        merged = merge_takes(takes, out, max_spread_ms, tell)
+    console.print(merge_table(merged))
+    if as_json:
+        _print_json(merged.to_dict())
 
 
 @app.command()

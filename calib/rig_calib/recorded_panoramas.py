@@ -6,8 +6,9 @@ from pathlib import Path
 from rig_protocol.decoding import decode_frame
 from rig_protocol.errors import ConfigurationError
 from rig_protocol.frames import EncodedFrame, PanoramicFrame
-from rig_protocol.recorded_sets import EncodedSet, with_frames
-from rig_protocol.recording import Recording
+from rig_protocol.recorded_hellos import recorded_hellos
+from rig_protocol.recorded_sets import EncodedSet, synchroniser_of, with_frames, with_sets
+from rig_protocol.recording import HELLOS, Recording
 
 _FRAMES = 5  # where nobody says how many: as many as `rig-server --calibrate` takes
 
@@ -17,6 +18,15 @@ def is_recording(capture: Path) -> bool:
     return capture.suffix == ".mcap" and not capture.is_dir()
 
 
+def encoded_sets(recording: Recording) -> Iterator[EncodedSet]:
+    """The sets that went out; those that the synchroniser makes now where a take has none (an agent's)."""
+    entries = recording.entries()
+    if not recording.has_sets:
+        hellos = recorded_hellos(recording.document(HELLOS), recording.description)
+        entries = with_sets(entries, synchroniser_of(hellos))
+    return with_frames(entries)
+
+
 def recorded_panoramas(take: Path, frames: int | None = None) -> Iterator[PanoramicFrame]:
     """The first `frames` sets (default: 5) that hold an undamaged frame of every camera, read one by one.
 
@@ -24,7 +34,7 @@ def recorded_panoramas(take: Path, frames: int | None = None) -> Iterator[Panora
     """
     recording = Recording(take)
     cameras, found, wanted = recording.description.camera_ids, 0, frames or _FRAMES
-    for one in with_frames(recording.entries()):
+    for one in encoded_sets(recording):
         held = [frame for camera_id in cameras if (frame := _whole(one, camera_id)) is not None]
         if len(held) == len(cameras):
             found += 1

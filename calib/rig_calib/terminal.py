@@ -13,6 +13,7 @@ from rich.text import Text
 from rig_calib.evaluation import Evaluation
 from rig_calib.figures.tables import camera_rows, edge_rows, key_figures, verdict
 from rig_calib.fusion.viewpoint import rig_viewpoint
+from rig_calib.merged_take import Merge
 from rig_calib.pose_graph.solution import Solution
 from rig_calib.rig_calibration import RigCalibration
 from rig_calib.stages import Progress
@@ -43,7 +44,7 @@ _SUMMARY_NAMES = {
     "absolute": "cameras, aligned",
 }
 _ERROR_COLUMNS = ("error of", "count", "mean °", "mean mm", "median °", "median mm", "max °", "max mm")
-_TEXT_COLUMNS = {"camera", "edge", "why not", "error of"}
+_TEXT_COLUMNS = {"camera", "edge", "why not", "error of", "take"}
 
 
 @contextmanager
@@ -94,6 +95,18 @@ def _consistency(evaluation: Evaluation) -> list[RenderableType]:
         for name, known in evaluation.consistency().items()
     ]
     return [Text(f"consistency: mean NEES per dof {', '.join(told)}")] if told else []
+
+
+def merge_table(merge: Merge) -> RenderableType:
+    """Every take with how well its clock is known on the common one, and what came of them."""
+    table = _empty_table(("take", "frames", "σ of its clock µs", "at worst µs"))
+    for part in merge.parts:
+        figures = (f"{ns / 1e3:.0f}" for ns in (part.typical_uncertainty_ns, part.worst_uncertainty_ns))
+        table.add_row(escape(part.path.name), f"{part.frames:,}", *figures)
+    torn = [f"{part.path} was not finished: read as far as it goes" for part in merge.parts if part.torn]
+    told = f"{merge.frames:,} frames in {merge.sets:,} sets, on the clock {merge.clock}"
+    lost = f"; {merge.not_recorded:,} frames had not been recorded" if merge.not_recorded else ""
+    return Group(table, Text(told + lost), *(Text(line, style="yellow") for line in torn))
 
 
 def pose_graph_report(solution: Solution) -> RenderableType:

@@ -15,10 +15,16 @@ def whole_file(path: Path) -> Iterator[BinaryIO]:
 
     RigError when it cannot be written (a full disk); nothing of it is left then.
     """
+    with whole_path(path) as part, part.open("wb") as file:
+        yield file
+
+
+@contextmanager
+def whole_path(path: Path) -> Iterator[Path]:
+    """As `whole_file`, for a library that opens the file itself: the path to give it."""
     part = path.with_name(path.name + ".part")
     try:
-        with part.open("wb") as file:
-            yield file
+        yield part
         part.replace(path)
     except OSError as error:
         raise RigError(f"{path} could not be written: {error.strerror}", Topic.FULL_DISK) from error

@@ -147,7 +147,7 @@ def as_pose(values: Any, name: str) -> Pose:
     """A 4×4 rigid transform from nested lists; DataError names what is wrong."""
     try:
         T = np.array(values, dtype=np.float64)
-    except (TypeError, ValueError) as error:
+    except (TypeError, ValueError, OverflowError) as error:
         raise DataError(f"{name} must be a 4×4 matrix: {error}") from error
     if not is_pose(T):
         raise DataError(f"{name} must be a 4×4 rigid transform (rotation, translation, 0 0 0 1)")

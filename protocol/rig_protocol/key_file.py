@@ -39,6 +39,11 @@ def rig_key(file: Path | None, insecure: bool) -> RigKey:
     return read_key(found)
 
 
+def has_key(file: Path | None) -> bool:
+    """Whether a key is named, or stands in one of KEY_PLACES."""
+    return file is not None or any(map(_may_exist, KEY_PLACES))
+
+
 def _may_exist(place: Path) -> bool:
     """True also where the folder is closed to us: reading the file then says so."""
     try:

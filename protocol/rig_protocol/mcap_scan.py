@@ -60,7 +60,7 @@ def scan(path: Path) -> Contents:
             raise DataError(f"{path} is no MCAP file: a recording begins with the bytes 89 MCAP0")
         for opcode, offset, length in _records(file, size):
             if opcode == _CHUNK and length >= _CHUNK_TIMES.size:
-                start_ns, end_ns = _CHUNK_TIMES.unpack(file.read(_CHUNK_TIMES.size))
+                start_ns, end_ns = sorted(_CHUNK_TIMES.unpack(file.read(_CHUNK_TIMES.size)))
                 contents.chunks.append(ChunkPlace(offset, length, start_ns, end_ns))
             elif opcode in (_ATTACHMENT, _METADATA, _CHANNEL):
                 small += _RECORD.size + length

@@ -65,6 +65,7 @@ MAX_GAUGE_NAME_BYTES = 32
 MIN_FPS, MAX_FPS = 0.1, 240.0
 # 4 bytes each; a frame with more gaps is asked for in several messages.
 MAX_RANGES = 250
+MAX_CLOCK_NAME_BYTES = 32
 MIN_SPREAD = 0.05
 _MAX_STEP_NS = 1_000_000_000
 
@@ -164,7 +165,7 @@ def _read_hello(body: bytes) -> Hello:
 
 
 def _hello_of(values: Fields, model: CameraModel) -> Hello:
-    hello = Hello(
+    return Hello(
         name=text(values, "name", MAX_NAME_BYTES),
         camera_id=optional(integer, values, "camera_id", 0, 255),
         serial=optional(text, values, "serial", MAX_NAME_BYTES),
@@ -177,9 +178,6 @@ def _hello_of(values: Fields, model: CameraModel) -> Hello:
         ciphers=ciphers(values, "ciphers"),
         controls=flag(values, "controls"),
     )
-    if not hello.color_codecs and not hello.depth_codecs:
-        raise DataError("neither color_codecs nor depth_codecs offers a stream")
-    return hello
 
 
 # ---- WELCOME
@@ -300,9 +298,12 @@ def _read_resend(body: bytes) -> Resend:
 
 # ---- PLAN
 
+_LATER_KEYS = ("offset_uncertainty_ns", "rig_clock")  # absent where nobody knows
+
 
 def _write_plan(plan: StreamPlan) -> bytes:
     values = {name: getattr(plan, name) for name in StreamPlan.__slots__}
+    values = {name: value for name, value in values.items() if value is not None or name not in _LATER_KEYS}
     try:
         _plan_of(values)
     except DataError as error:
@@ -316,6 +317,7 @@ def _read_plan(body: bytes) -> StreamPlan:
 
 def _plan_of(values: Fields) -> StreamPlan:
     step_ns = integer(values, "step_ns", 1, _MAX_STEP_NS)
+    values = dict.fromkeys(_LATER_KEYS) | dict(values)
     return StreamPlan(
         color_codec=optional(integer, values, "color_codec", 1, 255),
         depth_codec=optional(integer, values, "depth_codec", 1, 255),
@@ -324,6 +326,8 @@ def _plan_of(values: Fields) -> StreamPlan:
         phase_ns=integer(values, "phase_ns", 0, step_ns - 1),
         spread=number(values, "spread", MIN_SPREAD, 1.0),
         offset_ns=integer(values, "offset_ns", -(2**63), 2**63 - 1),
+        offset_uncertainty_ns=optional(integer, values, "offset_uncertainty_ns", 0, 2**63 - 1),
+        rig_clock=optional(text, values, "rig_clock", MAX_CLOCK_NAME_BYTES),
     )
 
 

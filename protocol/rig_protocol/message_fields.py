@@ -2,6 +2,7 @@
 
 import math
 import struct
+import sys
 from collections.abc import Callable, Mapping
 from typing import Any, TypeVar
 
@@ -43,9 +44,11 @@ def integer(values: Fields, key: str, lowest: int, highest: int) -> int:
 def number(values: Fields, key: str, lowest: float = -math.inf, highest: float = math.inf) -> float:
     """A finite number in [lowest, highest]."""
     value = values.get(key)
-    is_number = isinstance(value, int | float) and not isinstance(value, bool) and math.isfinite(value)
-    if is_number and lowest <= value <= highest:  # type: ignore[operator]  # is_number has told its type
-        return float(value)  # type: ignore[arg-type]
+    if isinstance(value, int | float) and not isinstance(value, bool):
+        # An integer of JSON may be too large for a float.
+        finite = math.isfinite(value) if isinstance(value, float) else abs(value) <= sys.float_info.max
+        if finite and lowest <= value <= highest:
+            return float(value)
     raise DataError(f"{key} must be a finite number from {lowest} to {highest}")
 
 

@@ -109,7 +109,8 @@ class StreamPlan:
     At most `fps` frames a second, one in each of the rig clock's intervals, and each sent over the share
     `spread` of its interval. Bursts of datagrams leave at rig times that are `phase_ns` modulo `step_ns`,
     so that those of different agents meet the switch one after another. Rig time is agent time and
-    `offset_ns`.
+    `offset_ns`, with the standard uncertainty `offset_uncertainty_ns`; `rig_clock` names the clock that it is
+    (`rig:...`), the same for all servers that run on a machine until it is booted anew. None: not told.
     """
 
     color_codec: int | None
@@ -119,6 +120,8 @@ class StreamPlan:
     phase_ns: int
     spread: float
     offset_ns: int
+    offset_uncertainty_ns: int | None = None
+    rig_clock: str | None = None
 
 
 @dataclass(frozen=True, slots=True)

@@ -4,12 +4,15 @@ from collections import deque
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 
-from rig_protocol.frames import EncodedFrame
-from rig_protocol.recording_format import Entry, RecordedSet
+from rig_protocol.frames import EncodedFrame, RgbdFrame
+from rig_protocol.messages import Hello
+from rig_protocol.recording_format import Entry, RecordedSet, time_of
+from rig_protocol.synchroniser import Policy, Synchroniser
 
 # Frames of a camera that a set may still ask for: those that waited in the synchroniser (8) and in sets that
 # nobody had taken (4), and as many again.
 _REMEMBERED = 24
+_DEADLINE_NS = 100_000_000  # in recorded time nobody waits for long
 
 
 @dataclass(frozen=True, slots=True)
@@ -38,3 +41,41 @@ def with_frames(entries: Iterable[Entry], from_ns: int = 0) -> Iterator[EncodedS
 
 def _stamped(came: Iterable[EncodedFrame], time_ns: int | None) -> EncodedFrame | None:
     return next((frame for frame in came if frame.timestamp_ns == time_ns), None)
+
+
+def synchroniser_of(
+    hellos: Mapping[int, Hello],
+    deadline_ns: int = _DEADLINE_NS,
+    max_spread_ns: int | None = None,
+    policy: Policy = "partial",
+) -> Synchroniser:
+    """One that groups the frames of a take without sets; `hellos`: its agents, by camera id."""
+    synchroniser = Synchroniser(hellos, deadline_ns, max_spread_ns, policy=policy)
+    for camera_id, hello in hellos.items():
+        synchroniser.camera_joined(camera_id, hello.fps)
+    return synchroniser
+
+
+def with_sets(entries: Iterable[Entry], synchroniser: Synchroniser) -> Iterator[Entry]:
+    """The entries of a take without sets, and the sets that the synchroniser makes, in recorded time."""
+    now_ns = 0
+    for entry in entries:
+        yield entry
+        if isinstance(entry, EncodedFrame):
+            now_ns = max(now_ns, time_of(entry))
+            synchroniser.add(_without_images(entry), now_ns)
+            yield from _sets_due(synchroniser, now_ns)
+    while synchroniser.waiting and (due_ns := synchroniser.next_timeout_ns()) is not None:
+        waiting, now_ns = synchroniser.waiting, max(now_ns, due_ns)
+        yield from _sets_due(synchroniser, now_ns)
+        if synchroniser.waiting == waiting:
+            return
+
+
+def _sets_due(synchroniser: Synchroniser, now_ns: int) -> Iterator[RecordedSet]:
+    while (panorama := synchroniser.next_panorama(now_ns)) is not None:
+        yield RecordedSet.of(panorama, now_ns)
+
+
+def _without_images(frame: EncodedFrame) -> RgbdFrame:
+    return RgbdFrame(frame.camera_id, frame.sequence, frame.timestamp_ns, frame.uncertainty_ns)

@@ -7,12 +7,14 @@ import json
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import closing
 from dataclasses import dataclass
+from datetime import datetime
 from pathlib import Path
 from typing import Any, Protocol
 
 from rig_protocol.errors import DataError, RigError
 from rig_protocol.mcap_scan import ChunkPlace, Contents, chunk_messages, open_recording, scan
 from rig_protocol.recording_format import (
+    CLOCK,
     DROPS,
     PROFILE,
     SETS,
@@ -22,6 +24,7 @@ from rig_protocol.recording_format import (
     Entry,
     EntryParser,
     RecordedSet,
+    clock_schema,
     drop_schema,
     image_schema,
     pack_entry,
@@ -61,8 +64,11 @@ class RecordingWriter:
     What was flushed survives the end of this process. `finish` adds the indexes that make any reader quick.
     """
 
-    def __init__(self, output: Output, created: str, now_ns: int) -> None:
-        """`created`: date and time in words (ISO 8601); `now_ns`: the same moment in rig time."""
+    def __init__(self, output: Output, created: str, now_ns: int, clock: str | None = None) -> None:
+        """`created`: date and time in words (ISO 8601); `now_ns`: the same moment in the take's clock.
+
+        `clock`: the name of that clock, where others may know it.
+        """
         from mcap.writer import CompressionType, Writer
 
         self._output = output
@@ -71,6 +77,8 @@ class RecordingWriter:
         self._writer: Any = Writer(stream, chunk_size=_CHUNK_BYTES, compression=CompressionType.NONE)
         self._writer.start(profile=PROFILE, library=PROFILE)
         about = {"version": str(VERSION), "created": created, "created_rig_time_ns": str(now_ns)}
+        if clock is not None:
+            about["clock"] = clock
         self._writer.add_metadata(TAKE, about)
         self._channels: dict[str, int] = {}
         self._attached: dict[str, bytes] = {}
@@ -129,6 +137,7 @@ class RecordingWriter:
 _SCHEMAS: dict[str, tuple[str, Callable[[], bytes]]] = {
     SETS: ("kinect_rig.Set", set_schema),
     DROPS: ("kinect_rig.DroppedFrames", drop_schema),
+    CLOCK: ("kinect_rig.Clock", clock_schema),
 }
 
 
@@ -154,6 +163,11 @@ class Recording:
         return tuple(part.path for part in self._parts if not part.contents.sound)
 
     @property
+    def clock(self) -> str | None:
+        """Name of the clock of all its times; None where it was not told."""
+        return self._parts[0].contents.metadata[TAKE].get("clock")
+
+    @property
     def start_ns(self) -> int:
         """Rig time of the first entry; DataError when there is none."""
         return min(chunk.start_ns for chunk in self._chunks())
@@ -162,6 +176,19 @@ class Recording:
     def end_ns(self) -> int:
         """Rig time of the last entry."""
         return max(chunk.end_ns for chunk in self._chunks())
+
+    @property
+    def utc_minus_rig_time_ns(self) -> int | None:
+        """What makes Unix time of rig time, to a second; None where the take does not tell its date."""
+        about = self._parts[0].contents.metadata[TAKE]
+        rig_time_ns = _created_rig_time_ns(about)
+        try:
+            created = datetime.fromisoformat(about.get("created", ""))
+        except ValueError:
+            return None
+        if rig_time_ns == 0 or created.tzinfo is None:
+            return None
+        return round(created.timestamp()) * 1_000_000_000 - rig_time_ns
 
     @property
     def attachments(self) -> dict[str, bytes]:
@@ -247,7 +274,9 @@ def _recover_part(path: Path) -> bool:
 
 def _rewrite(path: Path, contents: Contents, output: Any) -> None:
     about = contents.metadata[TAKE]
-    writer = RecordingWriter(output, about.get("created", ""), 0)
+    writer = RecordingWriter(
+        output, about.get("created", ""), _created_rig_time_ns(about), about.get("clock")
+    )
     for name, data in contents.attachments.items():
         try:
             writer.attach(name, json.loads(data), 0)
@@ -256,6 +285,12 @@ def _rewrite(path: Path, contents: Contents, output: Any) -> None:
     for entry in _entries_of(path, contents, 0, leave_out_damaged=True):
         writer.write(entry)
     writer.finish()
+
+
+def _created_rig_time_ns(about: Mapping[str, str]) -> int:
+    """Rig time at which a take began; 0 where it does not tell."""
+    told = about.get("created_rig_time_ns", "")
+    return int(told) if told.isdecimal() and len(told) < 20 else 0
 
 
 def _reads_well(path: Path, contents: Contents) -> bool:

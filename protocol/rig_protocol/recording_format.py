@@ -22,8 +22,12 @@ PROFILE = "kinect-rig"
 TAKE = "kinect-rig.take"
 """Name of the metadata record that tells the version of this format."""
 
-SETS, DROPS = "/sets", "/drops"
+SETS, DROPS, CLOCK = "/sets", "/drops", "/clock"
 MAX_CAMERA_ID = 255
+UTC, AGENT = "utc", "agent"
+"""Names of clocks: of the world, and an agent's own, which is nobody else's."""
+MAX_CLOCK_NAME = 32
+_MAX_TIES = 8
 _IMAGE_TOPIC = re.compile(r"/cam(\d{2,3})/(color|depth)")
 _MAX_TIME = 2**63 - 1
 _MAX_NUMBER = 2**64 - 1
@@ -54,11 +58,31 @@ class DroppedFrames:
     last_ns: int
 
 
-Entry = EncodedFrame | RecordedSet | DroppedFrames
+@dataclass(frozen=True, slots=True)
+class ClockTie:
+    """Another clock's time is the take's and `offset_ns`, with its standard uncertainty.
+
+    `clock`: `utc`, or a server's monotonic clock since it was booted, as the server calls it (`rig:...`).
+    """
+
+    clock: str
+    offset_ns: int
+    uncertainty_ns: int
+
+
+@dataclass(frozen=True, slots=True)
+class ClockReading:
+    """The take's clock at one of its moments against those that are known then."""
+
+    time_ns: int
+    ties: tuple[ClockTie, ...]
+
+
+Entry = EncodedFrame | RecordedSet | DroppedFrames | ClockReading
 
 
 def time_of(entry: Entry) -> int:
-    """When an entry became known to the server, in rig time: the order of a recording."""
+    """When an entry became known to who records, in the take's clock: the order of a recording."""
     match entry:
         case EncodedFrame():
             return max(0, entry.timestamp_ns if entry.received_ns is None else entry.received_ns)
@@ -66,6 +90,8 @@ def time_of(entry: Entry) -> int:
             return entry.taken_ns
         case DroppedFrames():
             return max(0, entry.last_ns)
+        case ClockReading():
+            return max(0, entry.time_ns)
 
 
 def pack_entry(entry: Entry) -> list[tuple[str, bytes]]:
@@ -79,6 +105,9 @@ def pack_entry(entry: Entry) -> list[tuple[str, bytes]]:
         case DroppedFrames():
             values = {name: getattr(entry, name) for name in ("camera_id", "count", "first_ns", "last_ns")}
             return [(DROPS, _pack(**values))]
+        case ClockReading():
+            ties = [[tie.clock, tie.offset_ns, tie.uncertainty_ns] for tie in entry.ties]
+            return [(CLOCK, _pack(time_ns=entry.time_ns, ties=ties))]
 
 
 class EntryParser:
@@ -97,6 +126,8 @@ class EntryParser:
                 return _parse_set(unpack_map(data))
             if topic == DROPS:
                 return _parse_drops(unpack_map(data))
+            if topic == CLOCK:
+                return _parse_clock(unpack_map(data))
             match = _IMAGE_TOPIC.fullmatch(topic)
             return None if match is None else self._parse_image(int(match[1]), match[2], data)
         except DataError as error:
@@ -144,6 +175,11 @@ def drop_schema() -> bytes:
     return _schema(
         "kinect_rig.DroppedFrames", dict.fromkeys(("camera_id", "count", "first_ns", "last_ns"), "integer")
     )
+
+
+def clock_schema() -> bytes:
+    """JSON Schema of a message of /clock."""
+    return _schema("kinect_rig.Clock", {"time_ns": "integer", "ties": "array"})
 
 
 def _schema(title: str, kinds: Mapping[str, Any]) -> bytes:
@@ -219,6 +255,24 @@ def _parse_drops(values: Fields) -> DroppedFrames:
         integer(values, "count", 1, _MAX_NUMBER),
         integer(values, "first_ns", -_MAX_TIME, _MAX_TIME),
         integer(values, "last_ns", -_MAX_TIME, _MAX_TIME),
+    )
+
+
+def _parse_clock(values: Fields) -> ClockReading:
+    ties = values.get("ties")
+    if not isinstance(ties, list) or len(ties) > _MAX_TIES:
+        raise DataError(f"ties must list at most {_MAX_TIES} clocks")
+    return ClockReading(integer(values, "time_ns", -_MAX_TIME, _MAX_TIME), tuple(map(_parse_tie, ties)))
+
+
+def _parse_tie(item: Any) -> ClockTie:
+    if not isinstance(item, list) or len(item) != 3:
+        raise DataError("ties must hold a clock, its offset and the uncertainty of that")
+    fields = dict(zip(("clock", "offset_ns", "uncertainty_ns"), item, strict=True))
+    return ClockTie(
+        text(fields, "clock", MAX_CLOCK_NAME),
+        integer(fields, "offset_ns", -_MAX_TIME, _MAX_TIME),
+        integer(fields, "uncertainty_ns", 0, _MAX_TIME),
     )
 
 

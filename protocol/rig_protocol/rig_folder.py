@@ -5,7 +5,7 @@ Images stay as the sensor delivered them. Readers ignore keys that they do not k
 
 import json
 import re
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -15,10 +15,11 @@ import numpy as np
 import numpy.typing as npt
 
 from rig_protocol.camera import CameraModel, RawDepthModel, as_pose
-from rig_protocol.errors import ConfigurationError, DataError
+from rig_protocol.errors import ConfigurationError, DataError, RigError
 from rig_protocol.frames import RgbdFrame
 from rig_protocol.gravity import Gravity, common_gravity
 from rig_protocol.poses import Pose
+from rig_protocol.troubleshooting import Topic
 
 _FRAME_PERIOD_NS = 33_333_333  # a folder holds no times: frame k is stamped as a 30-Hz sensor would
 _COLOR_NAME = re.compile(r"color_(\d+)\.png")
@@ -49,7 +50,7 @@ class RingDrawing:
         keys = ("radius", "yaw_step_deg", "tolerance_deg", "tolerance_m")
         try:
             numbers = {names.get(key, key): float(values[key]) for key in keys if key in values}
-        except (TypeError, ValueError) as error:
+        except (TypeError, ValueError, OverflowError) as error:
             raise DataError(f"ring must hold numbers: {error}") from error
         drawing = cls(**numbers)
         if not (drawing.tolerance_deg > 0 and drawing.tolerance_m > 0 and drawing.radius_m >= 0):
@@ -209,25 +210,41 @@ def read_frame(folder: Path, camera: CameraEntry, index: int) -> RgbdFrame:
 def write_rig_folder(folder: Path, description: RigDescription, frames: Iterable[RgbdFrame]) -> None:
     """Write every frame, its sequence as the panoramic index, then `nominal.json` with what they felt.
 
-    A Bayer image is demosaiced: the format holds colour as people look at it.
+    A Bayer image is demosaiced: the format holds colour as people look at it. RigError when a file cannot be
+    written.
     """
-    folder.mkdir(parents=True, exist_ok=True)
     felt: dict[int, list[Gravity]] = {}
-    for frame in frames:
-        if frame.gravity is not None:
-            felt.setdefault(frame.camera_id, []).append(frame.gravity)
-        directory = folder / description.camera(frame.camera_id).name
-        directory.mkdir(exist_ok=True)
-        for kind, image in _images(frame).items():
-            target = directory / f"{kind}_{frame.sequence:03d}.png"
-            if not cv2.imwrite(str(target), image):
-                raise DataError(f"{target} could not be written")
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        for frame in frames:
+            if frame.gravity is not None:
+                felt.setdefault(frame.camera_id, []).append(frame.gravity)
+            directory = folder / description.camera(frame.camera_id).name
+            directory.mkdir(exist_ok=True)
+            for name, data in encoded_images(frame, frame.sequence).items():
+                (directory / name).write_bytes(data)
+        write_rig_description(folder, with_gravity(description, felt))
+    except OSError as error:
+        raise RigError(f"{folder} could not be written: {error.strerror}", Topic.FULL_DISK) from error
+
+
+def encoded_images(frame: RgbdFrame, index: int) -> dict[str, bytes]:
+    """The PNG files of one camera's frame, by their names in its subfolder; a Bayer image is demosaiced."""
+    return {f"{kind}_{index:03d}.png": _png(image) for kind, image in _images(frame).items()}
+
+
+def with_gravity(description: RigDescription, felt: Mapping[int, Sequence[Gravity]]) -> RigDescription:
+    """The description with what the cameras felt over a capture, by camera id."""
     cameras = tuple(
         replace(entry, gravity=common_gravity(felt[entry.id])) if entry.id in felt else entry
         for entry in description.cameras
     )
-    told = replace(description, cameras=cameras).to_dict()
-    (folder / "nominal.json").write_text(json.dumps(told, indent=1) + "\n")
+    return replace(description, cameras=cameras)
+
+
+def write_rig_description(folder: Path, description: RigDescription) -> None:
+    """Write `nominal.json`."""
+    (folder / "nominal.json").write_text(json.dumps(description.to_dict(), indent=1) + "\n")
 
 
 def read_json(path: Path) -> Any:
@@ -245,7 +262,7 @@ def _camera_entry(item: Any, raw_model: RawDepthModel | None) -> CameraEntry:
         camera_id = int(item["id"])
         name = str(item.get("name") or f"cam{camera_id:02d}")
         T = item.get("T_rig_cam")
-    except (AttributeError, KeyError, TypeError, ValueError) as error:
+    except (AttributeError, KeyError, TypeError, ValueError, OverflowError) as error:
         raise DataError(f"a camera needs an integer `id`: {error!r}") from error
     if Path(name).name != name or name in ("", ".", ".."):
         raise DataError(f"camera {camera_id}: name {name!r} must be a plain folder name")
@@ -266,6 +283,13 @@ def _images(frame: RgbdFrame) -> dict[str, npt.NDArray[Any]]:
     depth_kind = "registered" if frame.depth_frame == "color" else "depth"
     images = {"color": color, "raw": frame.raw, depth_kind: frame.depth_mm}
     return {kind: image for kind, image in images.items() if image is not None}
+
+
+def _png(image: npt.NDArray[Any]) -> bytes:
+    made, data = cv2.imencode(".png", image)
+    if not made:
+        raise DataError(f"an image of {image.dtype} {image.shape} cannot become a PNG file")
+    return bytes(data)
 
 
 def _read_image(path: Path, dtype: np.dtype[Any]) -> npt.NDArray[Any] | None:

@@ -95,6 +95,8 @@ class ServerLink:
         """True where only who holds a secret key may join."""
         self.system_clock: SystemClockReading | None = None
         """What the server machine's system clock is worth, set by the shell every second or so."""
+        self.rig_clock: str | None = None
+        """What the shell calls the clock that it hands in, for those who tell it again later."""
         self._resend_budget = ResendBudget()
         self._sessions = SessionTable(self._resend_budget)
         self._clock_due: list[ServerSession] = []
@@ -141,7 +143,7 @@ class ServerLink:
     def datagrams_to_send(self, now_ns: int) -> list[tuple[bytes, Address]]:
         """Everything to transmit now; clock requests that `handle_timeout` found due are stamped `now_ns`."""
         for session in self._clock_due:
-            for datagram in session.periodic_messages(now_ns):
+            for datagram in session.periodic_messages(now_ns, self.rig_clock):
                 self._send(datagram, session.address)
         if self._clock_due:
             self._due_ns = min((session.due_ns for session in self._sessions), default=None)

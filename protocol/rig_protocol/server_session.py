@@ -109,7 +109,7 @@ class ServerSession:
             raise LinkUsageError(
                 f"slot {choice.slot} of {choice.slots} in a step of {choice.step_ns} ns: there is none"
             )
-        encode_body(_plan(choice, offset_ns=0))  # raises where it cannot be sent
+        encode_body(_plan(choice))  # raises where it cannot be sent
         self._choice = choice
 
     def seal(self, message: Message) -> bytes:
@@ -145,14 +145,17 @@ class ServerSession:
         self._reassembler.heard_of(heartbeat.frames, now_ns)
         self.due_ns = min(self.due_ns, self._reassembler.due_ns)
 
-    def periodic_messages(self, now_ns: int) -> list[bytes]:
-        """The clock request, stamped now, and the stream plan with it, where they are due."""
+    def periodic_messages(self, now_ns: int, rig_clock: str | None = None) -> list[bytes]:
+        """The clock request, stamped now, and the stream plan with it, where they are due.
+
+        `rig_clock`: the name of the clock that `now_ns` is of.
+        """
         if self._clock.next_request_ns > now_ns:
             return []
         messages: list[Message] = [self._clock.request(now_ns)]
         clock = self._clock.estimate
         if self._choice is not None and clock is not None:
-            messages.append(_plan(self._choice, clock.offset_ns))
+            messages.append(_plan(self._choice, clock.offset_ns, clock.uncertainty_ns, rig_clock))
         self._refresh_due()
         return [self.seal(message) for message in messages]
 
@@ -224,7 +227,12 @@ class ServerSession:
         return mapped
 
 
-def _plan(choice: StreamChoice, offset_ns: int) -> StreamPlan:
+def _plan(
+    choice: StreamChoice,
+    offset_ns: int = 0,
+    uncertainty_ns: int | None = None,
+    rig_clock: str | None = None,
+) -> StreamPlan:
     """A choice for an agent whose time plus `offset_ns` is rig time."""
     return StreamPlan(
         color_codec=choice.color_codec,
@@ -234,4 +242,6 @@ def _plan(choice: StreamChoice, offset_ns: int) -> StreamPlan:
         phase_ns=choice.phase_ns,
         spread=choice.spread,
         offset_ns=offset_ns,
+        offset_uncertainty_ns=uncertainty_ns,
+        rig_clock=rig_clock,
     )

@@ -7,6 +7,7 @@ import ctypes
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
+from pathlib import Path
 from typing import NamedTuple
 
 NanosecondClock = Callable[[], int]
@@ -25,6 +26,7 @@ _WANDER = 1e-6
 _PTP_ERROR_NS = 50_000
 _PTP_MAX_US = 2 * _GROWTH_US_PER_S
 _PTP_SEEN_NS = 5_000_000_000
+_BOOT_ID = Path("/proc/sys/kernel/random/boot_id")
 _C_LIBRARY = ctypes.CDLL(None)
 
 
@@ -105,6 +107,15 @@ class SystemClock:
             self._fresh_since_ns = None
         elif self._fresh_since_ns is None:
             self._fresh_since_ns = now_ns
+
+
+def boot_clock_name() -> str | None:
+    """A name for this machine's monotonic clock since it was booted; None where the kernel tells none."""
+    try:
+        boot_id = _BOOT_ID.read_text().replace("-", "").strip()
+    except OSError:
+        return None
+    return f"rig:{boot_id[:16]}" if boot_id[:16].isalnum() else None
 
 
 class _Timex(ctypes.Structure):

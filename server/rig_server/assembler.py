@@ -6,8 +6,8 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 from rig_protocol.frames import PanoramicFrame, RgbdFrame
+from rig_protocol.synchroniser import IncompleteSet, Synchroniser
 from rig_server.receiver import rig_time_ns
-from rig_server.synchroniser import IncompleteSet, Synchroniser
 
 # Sets that wait for a slow consumer: 11 MB each, and more would only make what it gets older.
 _MAX_READY = 4

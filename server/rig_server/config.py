@@ -11,9 +11,10 @@ from rig_protocol.camera import CameraModel
 from rig_protocol.datagram import MIN_DATAGRAM_SIZE
 from rig_protocol.errors import ConfigurationError, DataError
 from rig_protocol.events import Address
+from rig_protocol.recorder import TakeSettings
 from rig_protocol.rig_folder import RingDrawing, read_json
 from rig_protocol.settings import Settings, load_settings
-from rig_server.synchroniser import Policy
+from rig_protocol.synchroniser import Policy
 
 ENVIRONMENT_PREFIX = "RIG_SERVER_"
 CONFIG_PLACES = (Path("rig.toml"), Path("/etc/kinect-rig/rig.toml"))
@@ -124,17 +125,11 @@ class WatchSettings(Settings):
     """It looks at one panoramic frame in so many; a look at twelve cameras takes some 60 ms of one core."""
 
 
-class RecordingSettings(Settings):
+class RecordingSettings(TakeSettings):
     """How `--record FILE.mcap` records (docs/recording.md)."""
 
-    part_gib: float = Field(16.0, gt=0, le=1024)
-    """Size from which on the recording goes on in another file: FILE.001.mcap, FILE.002.mcap, ..."""
-    keep_free_mib: int = Field(64, ge=0, le=1 << 30)
-    """Room on the disk that a recording leaves: where there is less, it ends in order."""
     folder: Path = Path()
     """Where takes go that are begun while the server runs; relative to where it was started."""
-    queue_mib: int = Field(256, ge=8, le=1 << 20)
-    """Memory for frames that wait for a slow disk; what does not fit is dropped, and told in the file."""
 
 
 class ConsoleSettings(Settings):

@@ -6,9 +6,10 @@ from collections.abc import Callable, Iterable, Iterator, Mapping
 from prometheus_client.core import CounterMetricFamily, GaugeMetricFamily, HistogramMetricFamily, Metric
 from prometheus_client.registry import Collector
 
+from rig_protocol.recorder import RecordingStatus
 from rig_server.durations import SPREAD, STAGES, UNCERTAINTY
 from rig_server.histogram import HistogramSnapshot
-from rig_server.metrics import TEMPERATURE, CameraMetrics, DriftReport, RecordingStatus, RigStatus
+from rig_server.metrics import TEMPERATURE, CameraMetrics, DriftReport, RigStatus
 
 # Fields of CameraCounters that have a metric of their own: its name and what it counts.
 _COUNTERS = {

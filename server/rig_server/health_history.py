@@ -10,8 +10,9 @@ import numpy as np
 import numpy.typing as npt
 
 from rig_calib.drift.watch import CameraDrift
+from rig_protocol.recorder import RecordingStatus
 from rig_server.config import MAX_CAMERAS
-from rig_server.metrics import CameraMetrics, RecordingStatus, RigStatus
+from rig_server.metrics import CameraMetrics, RigStatus
 
 Array = npt.NDArray[np.float64]
 

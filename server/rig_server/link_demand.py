@@ -35,6 +35,11 @@ class _Camera:
     sizes: MeasuredSizes
     received: int = 0
 
+    @property
+    def loads_the_port(self) -> bool:
+        streams = self.hello.color_codecs or self.hello.depth_codecs
+        return bool(streams) and not self.on_this_machine
+
 
 @dataclass(slots=True)
 class LinkDemand:
@@ -67,8 +72,8 @@ class LinkDemand:
 
     @property
     def remote_ids(self) -> list[int]:
-        """Of those that load the port."""
-        return [i for i in self.camera_ids if not self._cameras[i].on_this_machine]
+        """Of those that load the port: not on this machine, and not those that only record on theirs."""
+        return [i for i in self.camera_ids if self._cameras[i].loads_the_port]
 
     @property
     def received(self) -> dict[int, int]:

@@ -4,14 +4,14 @@ import statistics
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from pathlib import Path
 
 from rig_calib.drift.watch import DriftStatus
 from rig_protocol.clock_sync import ClockEstimate
+from rig_protocol.recorder import RecordingStatus
+from rig_protocol.synchroniser import IncompleteSet
 from rig_server.assembler import SetRecord
 from rig_server.histogram import HistogramSnapshot
 from rig_server.sample_window import SampleWindow
-from rig_server.synchroniser import IncompleteSet
 from rig_server.unassigned import UnassignedAgent
 
 TEMPERATURE = "temperature_c"  # the gauge of an agent's heartbeat that has a column of its own
@@ -65,28 +65,6 @@ class DriftReport:
     names: Mapping[int, str]
     passed_over: int = 0
     failure: str | None = None
-
-
-@dataclass(frozen=True, slots=True)
-class RecordingStatus:
-    """A recording: for how long, what stands in the file, what the disk was too slow for, and the room left.
-
-    `ended` says why it ended before it was stopped.
-    """
-
-    path: Path
-    seconds: float = 0.0
-    frames: int = 0
-    bytes: int = 0
-    dropped: int = 0
-    waiting_bytes: int = 0
-    free_bytes: int = 0
-    ended: str | None = None
-
-    @property
-    def bytes_per_s(self) -> float:
-        """Mean rate since it began."""
-        return self.bytes / self.seconds if self.seconds > 0 else 0.0
 
 
 @dataclass(frozen=True, slots=True)

@@ -24,11 +24,14 @@ from rig_protocol.events import (
 )
 from rig_protocol.frames import PanoramicFrame, RgbdFrame
 from rig_protocol.messages import ControlValue, Hello
+from rig_protocol.recorder import RecordingStatus, TakeContext
+from rig_protocol.recording_format import UTC, ClockReading, ClockTie
 from rig_protocol.rig_folder import RigDescription
 from rig_protocol.rig_key import RigKey
 from rig_protocol.roster import Roster, Slot, known_serial
 from rig_protocol.server_link import ServerLink
-from rig_protocol.system_clock import SystemClock
+from rig_protocol.synchroniser import Synchroniser
+from rig_protocol.system_clock import SystemClock, boot_clock_name
 from rig_protocol.troubleshooting import Topic, see
 from rig_server.assembler import Assembler
 from rig_server.attendance import absence_message, is_whole
@@ -37,15 +40,14 @@ from rig_server.decoder import FrameDecoder
 from rig_server.description import describe_rig
 from rig_server.durations import Durations
 from rig_server.link_budget import Port
-from rig_server.metrics import RecordingStatus, RigStatus
+from rig_server.metrics import RigStatus
 from rig_server.receiver import Receiver, rig_time_ns
 from rig_server.remote_control import RemoteControl
 from rig_server.rig_status import StatusReader
-from rig_server.sinks.record import RecordSink
 from rig_server.stream_control import StreamControl
 from rig_server.stream_planner import StreamPlanner
-from rig_server.synchroniser import Synchroniser
 from rig_server.take_documents import take_documents
+from rig_server.take_recording import TakeRecording
 from rig_server.unassigned import UnassignedAgents
 
 logger = logging.getLogger(__name__)
@@ -79,6 +81,7 @@ class LivePipeline:
             datagram_size=Port(settings.link.speed_mbit, settings.link.mtu).datagram_size,
             objection=planner.objection,
         )
+        self._link.rig_clock = boot_clock_name()
         self._streams = StreamControl(self._link, planner)
         self._receiver = Receiver(
             self._link,
@@ -102,8 +105,7 @@ class LivePipeline:
             self._streams,
         )
         self._take = record
-        self._recording = threading.Lock()  # one thread at a time starts or ends a recording
-        self._record: RecordSink | None = None
+        self._recording = TakeRecording(settings.recording, self._take_context)
         self._system_clock = SystemClock(rig_time_ns, time.time_ns)
         self._system_clock_read_ns = 0
         self._presence = threading.Lock()  # guards what follows
@@ -155,21 +157,11 @@ class LivePipeline:
 
         ConfigurationError when it exists or cannot be written, RigError while another recording runs.
         """
-        with self._recording:
-            if self._record is not None and self._record.status().ended is None:
-                raise RigError(f"{self._record.status().path} is being recorded: stop that first")
-            record = RecordSink(take, self._settings.recording, self._documents, self._camera_counts)
-            record.start()
-            self._record = record
+        self._recording.start(take)
 
     def stop_recording(self) -> RecordingStatus | None:
         """End the recording in order; how it was, None where nobody recorded."""
-        with self._recording:
-            record, self._record = self._record, None
-            if record is None:
-                return None
-            record.stop()
-            return record.status()
+        return self._recording.stop()
 
     def absence(self) -> str | None:
         """Which expected cameras are not here and what to do, or None; RigError when receiving has failed."""
@@ -184,18 +176,17 @@ class LivePipeline:
         """The next set, or None when none came within `timeout_s`; RigError when receiving has failed."""
         self._check_receiver()
         panorama = self._assembler.next_panorama(timeout_s)
-        record = self._record
+        record = self._recording.sink  # others end it
         if panorama is not None and record is not None:
-            record.add_set(panorama)
+            record.add_set(panorama, rig_time_ns())
         return panorama
 
     def status(self) -> RigStatus:
         """The rig at this moment; any thread may ask."""
         with self._presence:
             unassigned = self._unassigned.here(rig_time_ns())
-        record = self._record
-        recording = None if record is None else record.status()
-        return replace(self._status.read(self.hellos), unassigned=unassigned, recording=recording)
+        status = self._status.read(self.hellos)
+        return replace(status, unassigned=unassigned, recording=self._recording.status())
 
     def control(
         self, cameras: int | Collection[int] | None, name: str, value: ControlValue
@@ -233,12 +224,13 @@ class LivePipeline:
         self._streams.take(event, rig_time_ns())
         match event:
             case FrameReceived(frame):
-                record = self._record  # others end it
+                record = self._recording.sink  # others end it
                 if record is not None:
-                    record.add_frame(frame)
+                    record.add(frame)
                 self._decoder.submit(frame)
             case CameraJoined(camera_id, hello, address):
-                self._assembler.camera_joined(camera_id, hello.fps)
+                if hello.color_codecs or hello.depth_codecs:  # sets wait for no camera that only records
+                    self._assembler.camera_joined(camera_id, hello.fps)
                 with self._presence:
                     self._connected.add(camera_id)
                     self._hellos[camera_id] = hello
@@ -263,6 +255,17 @@ class LivePipeline:
     def _documents(self) -> Mapping[str, Any]:
         """What a recording tells of the rig, as it is now."""
         return take_documents(self._settings, self.description, self.hellos, self.calibration)
+
+    def _take_context(self) -> TakeContext:
+        return TakeContext(self._documents, self._camera_counts, self._clock_reading, self._link.rig_clock)
+
+    def _clock_reading(self) -> ClockReading | None:
+        """The rig clock against the world's, where something disciplines this machine's."""
+        system_clock = self._link.system_clock
+        if system_clock is None or system_clock.error_ns is None:
+            return None
+        tie = ClockTie(UTC, system_clock.wall_minus_monotonic_ns, system_clock.error_ns)
+        return ClockReading(rig_time_ns(), (tie,))
 
     def _camera_counts(self) -> Mapping[str, Mapping[str, int]]:
         """What came of every camera, and what was lost on the way."""

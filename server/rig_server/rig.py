@@ -17,12 +17,13 @@ from rig_protocol.frames import PanoramicFrame
 from rig_protocol.key_file import rig_key
 from rig_protocol.messages import ControlValue, Hello
 from rig_protocol.poses import Pose
+from rig_protocol.recorder import RecordingStatus
 from rig_protocol.rig_folder import RigDescription
 from rig_protocol.rig_key import RigKey
 from rig_protocol.roster import Slot
 from rig_protocol.troubleshooting import Topic
 from rig_server.config import MAX_CAMERAS, RigSettings, load_rig_settings, parse_address
-from rig_server.metrics import RecordingStatus, RigStatus
+from rig_server.metrics import RigStatus
 from rig_server.pipeline import LivePipeline
 from rig_server.recorded import RecordedRig
 from rig_server.replay import ReplayedRig, ReplayOptions
@@ -152,12 +153,19 @@ class Rig:
         return cls(LivePipeline(settings, rig_key(settings.key_file, settings.insecure), record), settings)
 
     @classmethod
-    def replayed(cls, take: Path, settings: RigSettings, options: ReplayOptions | None = None) -> Self:
+    def replayed(
+        cls,
+        take: Path,
+        settings: RigSettings,
+        options: ReplayOptions | None = None,
+        record: Path | None = None,
+    ) -> Self:
         """A recorded take; the default options play it once, at the speed at which it was recorded.
 
+        `record`: a new file to record to what is played.
         ConfigurationError when there is no such file, DataError when it is no recording.
         """
-        return cls(ReplayedRig(take, settings, options or ReplayOptions()), settings)
+        return cls(ReplayedRig(take, settings, options or ReplayOptions(), record), settings)
 
     @classmethod
     def simulated(

@@ -3,6 +3,7 @@
 from collections.abc import Mapping
 
 from rig_calib.drift.words import moved_message
+from rig_protocol.recorder import RecordingStatus
 from rig_server.durations import (
     EXPOSURE_TO_RECEIVED,
     RECEIVED_TO_DECODED,
@@ -10,7 +11,7 @@ from rig_server.durations import (
     UNCERTAINTY,
 )
 from rig_server.histogram import HistogramSnapshot
-from rig_server.metrics import RecordingStatus, RigStatus
+from rig_server.metrics import RigStatus
 
 _STAGES = {
     EXPOSURE_TO_RECEIVED: "arrival",

@@ -12,7 +12,7 @@ import numpy as np
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 from rig_protocol.frames import PanoramicFrame
-from rig_server.synchroniser import Policy
+from rig_protocol.synchroniser import Policy
 from support.frame_streams import Arrival, free_running, joined
 
 CAMERAS = 12

@@ -3,8 +3,8 @@
 python tests/benchmarks/console_latency.py [--seconds 20] [--cameras 12] [--fps 30]
 
 Prints JSON: percentiles in ms, and `skipped` with the reason where there is no Chromium. Cameras, server and
-browser share this machine. There is no calibration, and so no cloud: drawing it in software, where there is no
-GPU, would be measured. The bar is 200 ms.
+browser share this machine. There is no calibration, and so no cloud: without a GPU it is drawn in software,
+which would be measured. The bar is 200 ms.
 """
 
 import argparse

@@ -14,6 +14,7 @@ from pathlib import Path
 import numpy as np
 
 from rig_protocol.frames import EncodedFrame, Payload
+from rig_protocol.recorder import TakeContext
 from rig_protocol.recording import Recording
 from rig_server.config import RecordingSettings
 from rig_server.sinks.record import RecordSink
@@ -43,14 +44,14 @@ def measure(seconds: float, folder: Path) -> dict[str, float]:
     """Record for so long at the rig's rate, then read everything back."""
     noise = np.random.default_rng(0).bytes(COLOR_BYTES + 4096)
     take = folder / "take.mcap"
-    sink = RecordSink(take, RecordingSettings(), dict, dict)
+    sink = RecordSink(take, RecordingSettings(), TakeContext())
     sink.start()
     cpu_s, begun_s = cpu(), time.monotonic()
     count = round(seconds * FPS)
     most_waiting = 0
     for k in range(count):
         for camera_id in range(CAMERAS):
-            sink.add_frame(frame(camera_id, k, noise))
+            sink.add(frame(camera_id, k, noise))
         most_waiting = max(most_waiting, sink.status().waiting_bytes)
         time.sleep(max(0.0, begun_s + (k + 1) / FPS - time.monotonic()))
     elapsed_s = time.monotonic() - begun_s

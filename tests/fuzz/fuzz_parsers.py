@@ -2,10 +2,11 @@
 
 python tests/fuzz/fuzz_parsers.py TARGET [libFuzzer options], for example -max_total_time=120
 
-A target fails by any exception other than DataError, by a broken invariant, by 2 GiB of memory or by 10 s
-for one input. `make fuzz` gives each target two minutes; a failing input is left in build/fuzz/.
+A target fails by any exception other than RigError and its kin, by a broken invariant, by 2 GiB of memory or
+by 10 s for one input. `make fuzz` gives each target two minutes; a failing input is left in build/fuzz/.
 """
 
+import io
 import sys
 import tempfile
 from collections.abc import Callable, Iterator
@@ -17,13 +18,21 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 with atheris.instrument_imports(include=["rig_protocol"], enable_loader_override=False):
     from rig_protocol.agent_link import AgentLink
+    from rig_protocol.camera import CameraModel
     from rig_protocol.codecs import COLOR_CODECS, DEPTH_CODECS, codec
     from rig_protocol.datagram import DatagramBatch, MessageType, pack_prefix
-    from rig_protocol.errors import DataError
+    from rig_protocol.errors import DataError, RigError
     from rig_protocol.events import FrameReceived
     from rig_protocol.frame_unit import pack_unit, parse_unit
+    from rig_protocol.frames import EncodedFrame, Payload
+    from rig_protocol.mcap_scan import scan
     from rig_protocol.message_bytes import decode_body, encode_body
     from rig_protocol.reassembler import MAX_OPEN_UNITS
+    from rig_protocol.recorded_hellos import recorded_hellos, told_hellos
+    from rig_protocol.recorded_sets import with_frames
+    from rig_protocol.recording import DESCRIPTION, HELLOS, Recording, RecordingWriter, recover
+    from rig_protocol.recording_format import ClockReading, ClockTie, DroppedFrames, RecordedSet, pack_entry
+    from rig_protocol.rig_folder import CameraEntry, RigDescription
     from rig_protocol.rig_key import RigKey
     from rig_protocol.server_link import ServerLink
 
@@ -42,7 +51,7 @@ from support.wire import (
 )
 
 _CRASHES = Path("build/fuzz")
-_OPTIONS = ("-timeout=10", "-rss_limit_mb=2048", "-max_len=4096", "-print_final_stats=1")
+_OPTIONS = ("-timeout=10", "-rss_limit_mb=2048", "-print_final_stats=1")
 _CODECS = (*COLOR_CODECS, *DEPTH_CODECS)
 _BODIES = tuple(MessageType(k) for k in range(1, 11))
 _MAX_PIXELS = 4096 * 4096
@@ -132,8 +141,32 @@ def key_files(data: bytes) -> None:
     RigKey.parse(data.decode("ascii", errors="replace"))
 
 
+def recordings(data: bytes) -> None:
+    """A file that claims to be a take: read, asked for all that it tells, and mended."""
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder, "take.mcap")
+        path.write_bytes(data)
+        try:
+            _read_take(path)
+        except DataError:
+            recover(path)  # it may refuse, too
+            _read_take(path)
+
+
+def _read_take(path: Path) -> None:
+    recording = Recording(path)
+    for entry in recording.entries():
+        assert pack_entry(entry)  # what was read can be written
+    if recording.has_sets:
+        for one in with_frames(recording.entries()):
+            assert any(one.frames.values())
+    recorded_hellos(recording.document(HELLOS), recording.description)
+    assert recording.start_ns <= recording.end_ns
+    recording.utc_minus_rig_time_ns  # noqa: B018  # it parses
+
+
 TARGETS: dict[str, Callable[[bytes], None]] = {
-    each.__name__: each for each in (server_link, agent_link, bodies, units, codecs, key_files)
+    each.__name__: each for each in (server_link, agent_link, bodies, units, codecs, key_files, recordings)
 }
 
 
@@ -155,9 +188,40 @@ def _seeds(target: str) -> list[bytes]:
         "bodies": [bytes([0]) + encode_body(make_hello())[1]],
         "units": [pack_unit(make_frame(size=300))],
         "codecs": [bytes([k]) + codec(id_).encode(_image(id_, image)) for k, id_ in enumerate(_CODECS)],
+        "recordings": [*_takes()],
         "key_files": [RigKey.INSECURE.to_text().encode()],
     }
     return by_target[target]
+
+
+def _takes() -> Iterator[bytes]:
+    """A small take, finished and torn; without check sums, which would keep the fuzzer out of its chunks."""
+    camera = CameraEntry(3, "cam03", CameraModel())
+    for finish in (True, False):
+        output = io.BytesIO()
+        writer = RecordingWriter(output, "2026-01-02", 5, "agent")
+        writer.attach(DESCRIPTION, RigDescription((camera,)).to_dict(), 5)
+        writer.attach(HELLOS, told_hellos({3: make_hello(camera_id=3)}), 5)
+        for k in range(2):
+            frame = EncodedFrame(3, k, 9 + k, color=Payload(1, b"color"), depth=Payload(2, b"depth"))
+            writer.write(frame)
+            writer.write(RecordedSet(k, 10 + k, {3: frame.timestamp_ns, 4: None}))
+        writer.write(ClockReading(12, (ClockTie("utc", 1, 2),)))
+        writer.write(DroppedFrames(3, 1, 2, 3))
+        writer.flush()
+        if finish:
+            writer.finish()
+        yield _without_check_sums(output.getvalue())
+
+
+def _without_check_sums(take: bytes) -> bytes:
+    changed = bytearray(take)
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder, "take.mcap")
+        path.write_bytes(take)
+        for chunk in scan(path).chunks:
+            changed[chunk.offset + 24 : chunk.offset + 28] = bytes(4)
+    return bytes(changed)
 
 
 def _image(codec_id: int, image: "np.ndarray") -> "np.ndarray":
@@ -175,14 +239,23 @@ def main() -> None:
     def one_input(data: bytes) -> None:
         try:
             target(data)
-        except DataError:
+        except RigError:
             return  # the honest answer
 
+    seeds = _seeds(name)
+    longest = max(4096, *map(len, seeds))
     _CRASHES.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory() as corpus:
-        for k, seed in enumerate(_seeds(name)):
+        for k, seed in enumerate(seeds):
             (Path(corpus) / f"seed{k}").write_bytes(seed)
-        words = [sys.argv[0], *_OPTIONS, f"-artifact_prefix={_CRASHES}/{name}-", *options, corpus]
+        words = [
+            sys.argv[0],
+            *_OPTIONS,
+            f"-max_len={longest}",
+            f"-artifact_prefix={_CRASHES}/{name}-",
+            *options,
+            corpus,
+        ]
         atheris.Setup(words, one_input)
         atheris.Fuzz()
 

@@ -5,9 +5,9 @@ from typing import NamedTuple
 
 import numpy as np
 
+from rig_protocol.camera_queue import MAX_PENDING
 from rig_protocol.frames import PanoramicFrame, RgbdFrame
-from rig_server.camera_queue import MAX_PENDING
-from rig_server.synchroniser import Policy, Synchroniser
+from rig_protocol.synchroniser import Policy, Synchroniser
 
 MS = 1_000_000
 S = 1000 * MS

@@ -7,9 +7,10 @@ from rig_calib.drift.watch import CameraDrift, DriftStatus, PairDrift
 from rig_protocol.clock_sync import ClockEstimate
 from rig_protocol.counters import CameraCounters
 from rig_protocol.frames import RgbdFrame
+from rig_protocol.recorder import RecordingStatus
 from rig_server.assembler import SetRecord
 from rig_server.durations import Durations
-from rig_server.metrics import CameraMetrics, DriftReport, RecordingStatus, RigStatus
+from rig_server.metrics import CameraMetrics, DriftReport, RigStatus
 
 MS = 1_000_000
 

@@ -13,7 +13,7 @@ from typing import Self, TypeVar
 from rig_protocol.codecs import COLOR_CODECS, DEPTH_CODECS
 from rig_protocol.events import Address, ControlAnswered, FrameReceived, ServerEvent
 from rig_protocol.frames import EncodedFrame
-from rig_protocol.messages import ControlValue
+from rig_protocol.messages import ControlValue, StreamChoice
 from rig_protocol.rig_key import RigKey
 from rig_protocol.roster import Roster
 from rig_protocol.server_link import ServerLink
@@ -41,8 +41,10 @@ class LoopbackServer:
         self._link = ServerLink(
             roster or Roster(open=True), rig_key, secrets.token_bytes, COLOR_CODECS, DEPTH_CODECS
         )
+        self._link.rig_clock = "rig:of-the-test"
         self.events: list[ServerEvent] = []
         self._asked: deque[tuple[int, str, ControlValue]] = deque()
+        self._planned: deque[tuple[int, StreamChoice]] = deque()
         self._changed = threading.Condition()
         self._stopping = threading.Event()
         self._silently = False
@@ -75,6 +77,10 @@ class LoopbackServer:
         self._asked.append((camera_id, name, value))
         return self.wait_for(ControlAnswered, answered + 1)
 
+    def plan(self, camera_id: int, choice: StreamChoice) -> None:
+        """What an agent is to send from now on."""
+        self._planned.append((camera_id, choice))
+
     def stop(self, *, silently: bool = False) -> None:
         """End the server; harmless when ended."""
         self._silently = silently
@@ -98,6 +104,8 @@ class LoopbackServer:
             self._receive()
             while self._asked:
                 self._link.control(*self._asked.popleft(), time.monotonic_ns())
+            while self._planned:
+                self._link.plan_stream(*self._planned.popleft())
             self._link.handle_timeout(time.monotonic_ns())
             self._send()
         if not self._silently:

@@ -1,5 +1,6 @@
 """A take recorded from agents in threads of the test, and the comparison of sets bit for bit."""
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -32,6 +33,11 @@ def same_set(one: PanoramicFrame, other: PanoramicFrame) -> bool:
     return times[0] == times[1] and all(same_frame(one.frames[i], other.frames[i]) for i in one.frames)
 
 
+def same_images(one: PanoramicFrame, other: PanoramicFrame) -> bool:
+    """Everything of a set's frames, but for their times."""
+    return all(same_frame(_untimed(one.frames[i]), _untimed(other.frames[i])) for i in one.frames)
+
+
 def same_frame(one: RgbdFrame | None, other: RgbdFrame | None) -> bool:
     """Every field, images bit for bit."""
     if one is None or other is None:
@@ -42,3 +48,7 @@ def same_frame(one: RgbdFrame | None, other: RgbdFrame | None) -> bool:
         else value == getattr(other, name)
         for name in RgbdFrame.__slots__
     )
+
+
+def _untimed(frame: RgbdFrame | None) -> RgbdFrame | None:
+    return frame and replace(frame, timestamp_ns=0, received_ns=None)

@@ -19,8 +19,8 @@ from rig_protocol.datagram import DatagramBatch
 from rig_protocol.events import CameraJoined, FrameReceived
 from rig_protocol.frames import EncodedFrame, Payload, RgbdFrame
 from rig_protocol.server_link import ServerLink
+from rig_protocol.synchroniser import Synchroniser
 from rig_protocol.testing import AgentClock, Faults, LossyLink
-from rig_server.synchroniser import Synchroniser
 from support.wire import COLOR, DEPTH, make_agent, make_hello, make_server
 
 FRAME_BYTES = 195_000  # a lossless pair of the shared real frames

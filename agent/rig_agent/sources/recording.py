@@ -156,6 +156,6 @@ def _rate(recording: Recording, camera_id: int) -> float:
     try:
         agents = recording.document(HELLOS)["agents"]
         fps = next((float(one["fps"]) for one in agents if one["camera_id"] == camera_id), _DEFAULT_FPS)
-    except (KeyError, TypeError, ValueError) as error:
+    except (KeyError, TypeError, ValueError, OverflowError) as error:
         raise DataError(f"{recording.path}: {HELLOS} is malformed: {error!r}") from error
     return fps if 0.1 <= fps <= 240 else _DEFAULT_FPS

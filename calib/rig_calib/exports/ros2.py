@@ -22,11 +22,11 @@ LAUNCH_FILE = "rig.launch.py"
 URDF_FILE = "rig.urdf"
 ROOT = "rig"
 
-_COLOR, _DEPTH = "_color_optical_frame", "_depth_optical_frame"
+COLOR_FRAME, DEPTH_FRAME = "_color_optical_frame", "_depth_optical_frame"
 _TABLE = "TRANSFORMS"
 _LAUNCH = f'''"""Static transforms of a calibrated rig, made by `rig-calib export`.
 
-{ROOT} (z up) -> NAME{_COLOR} -> NAME{_DEPTH}: z forward, x right, y down in the image (REP 103).
+{ROOT} (z up) -> NAME{COLOR_FRAME} -> NAME{DEPTH_FRAME}: z forward, x right, y down in the image (REP 103).
 """
 
 from launch import LaunchDescription
@@ -129,9 +129,9 @@ def read_urdf(text: str) -> ExportedRig:
 def _joints(rig: ExportedRig) -> list[_Joint]:
     joints = []
     for name, camera in zip(rig.ros_names(), rig.cameras, strict=True):
-        joints.append(_Joint(ROOT, name + _COLOR, camera.T_rig_camera))
+        joints.append(_Joint(ROOT, name + COLOR_FRAME, camera.T_rig_camera))
         if camera.T_color_depth is not None:
-            joints.append(_Joint(name + _COLOR, name + _DEPTH, camera.T_color_depth))
+            joints.append(_Joint(name + COLOR_FRAME, name + DEPTH_FRAME, camera.T_color_depth))
     return joints
 
 
@@ -139,7 +139,7 @@ def _rig(joints: list[_Joint]) -> ExportedRig:
     depths = {joint.parent: joint.T_parent_child for joint in joints if joint.parent != ROOT}
     cameras = [
         ExportedCamera(
-            joint.child.removesuffix(_COLOR), joint.T_parent_child, T_color_depth=depths.get(joint.child)
+            joint.child.removesuffix(COLOR_FRAME), joint.T_parent_child, T_color_depth=depths.get(joint.child)
         )
         for joint in joints
         if joint.parent == ROOT

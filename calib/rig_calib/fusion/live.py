@@ -7,27 +7,30 @@ from queue import SimpleQueue
 from types import TracebackType
 from typing import Self
 
+import cv2
 import numpy as np
 import numpy.typing as npt
 
 from rig_calib.fusion.cylinder import Cylinder
 from rig_calib.fusion.gains import Gain
-from rig_calib.fusion.live_kernels import (
+from rig_calib.fusion.live_arrays import (
     BAYER,
     BGR,
+    EMPTY,
     GREY,
+    MAX_WIDTH,
+    NOTHING,
+    PITCH,
     Drum,
     Lens,
-    Measured,
     Ring,
     Scratch,
-    blend_columns,
-    clean_depth,
-    close_ranks,
-    place_points,
 )
+from rig_calib.fusion.live_cleaning import clean_depth
+from rig_calib.fusion.live_panorama import blend_columns, close_ranks
+from rig_calib.fusion.live_points import pack_colors, place_points
 from rig_calib.fusion.panorama import DEFAULT_CIRCLE_PX
-from rig_calib.fusion.ray_tables import PlacedGrid, circle_around, color_scan, drum_around, ring_tables
+from rig_calib.fusion.ray_tables import PlacedGrid, circle_around, drum_around, ring_tables
 from rig_calib.fusion.viewpoint import rig_viewpoint
 from rig_calib.rig_calibration import RigCalibration
 from rig_protocol.camera import CameraModel
@@ -94,6 +97,33 @@ class _Images:
     in_mm: bool
     color: ImageU8
     kind: int
+    size: tuple[int, int]
+
+
+@dataclass(frozen=True, slots=True, eq=False)
+class _Strip:
+    """A band of the panorama, column by column; (columns,H) but for `turned`.
+
+    Column by column into the panorama itself, every pixel would cost a cache line.
+    """
+
+    colors: npt.NDArray[np.uint32]
+    depths: Array32
+    turned: npt.NDArray[np.uint32]  # (H,columns)
+
+    @classmethod
+    def of_height(cls, height: int) -> "_Strip":
+        shape = _BAND_COLUMNS, height
+        turned = np.zeros(shape[::-1], np.uint32)
+        return cls(np.zeros(shape, np.uint32), np.zeros(shape, np.float32), turned)
+
+    def write(self, color: ImageU8, depth: Array32) -> None:
+        """Into the band's colour (H,columns,3), BGR, and depth."""
+        height, columns = depth.shape
+        cv2.transpose(self.depths[:columns], depth)
+        turned = self.turned[:, :columns]
+        cv2.transpose(self.colors[:columns].view(np.int32), turned.view(np.int32))
+        cv2.cvtColor(turned.view(np.uint8).reshape(height, columns, 4), cv2.COLOR_BGRA2BGR, color)
 
 
 class LiveFusion:
@@ -120,6 +150,8 @@ class LiveFusion:
         grids = [self._grid(calibration, models, camera_id) for camera_id in self.camera_ids]
         if len({grid.shape for grid in grids}) > 1:
             raise DataError("live fusion takes cameras whose depth images are all of one size")
+        if grids[0].shape[1] > MAX_WIDTH:
+            raise DataError(f"live fusion takes depth images of at most {MAX_WIDTH} columns")
         self._grids = grids
         view = rig_viewpoint(placed, calibration.rig_frame).T_rig_view.copy()
         if self.settings.centre_m is not None:
@@ -130,8 +162,10 @@ class LiveFusion:
         self._ring: Ring = ring_tables(grids)
         self._drum: Drum = drum_around(grids, inverse(view), self.cylinder, circle_px)
         self._lenses: list[Lens] = [grid.lens() for grid in grids]
-        self._scans = [color_scan(table) for table in self._ring.color_pixels]
-        self._gains = [_gain_table(self.settings.gains.get(i)) for i in self.camera_ids]
+        self._gains = [
+            np.asarray(self.settings.gains.get(i, (1.0, 1.0, 1.0)), np.float32) for i in self.camera_ids
+        ]
+        self._interrupted = False
         self._make_buffers(grids[0].shape)
         self._pool = ThreadPoolExecutor(self.settings.threads, "fusion")
 
@@ -158,10 +192,14 @@ class LiveFusion:
             images.append(None if isinstance(found, str) else found)
             if isinstance(found, str):
                 skipped.append(f"camera {camera_id}: left out, {found}")
+        if self._interrupted:  # what was drawn then was never blended
+            self._drum.cells[:] = EMPTY
+        self._interrupted = True
         cameras = range(len(self.camera_ids))
         self._in_threads(lambda k: self._clean(k, images[k]), cameras)
         self._in_threads(lambda k: self._place(k, images[k]), cameras)
         self._in_threads(lambda first: self._finish(first), [_CLOUD, *self._bands])
+        self._interrupted = False
         count = int(self._starts[-1])
         return FusedFrame(
             index=panorama.index,
@@ -175,6 +213,11 @@ class LiveFusion:
             skipped=tuple(skipped),
         )
 
+    @property
+    def T_rig_depth(self) -> dict[int, Pose]:
+        """Where every camera's depth image is seen from, by camera id."""
+        return {i: grid.T_rig_grid for i, grid in zip(self.camera_ids, self._grids, strict=True)}
+
     def _grid(
         self, calibration: RigCalibration, models: Mapping[int, CameraModel], camera_id: int
     ) -> PlacedGrid:
@@ -186,9 +229,7 @@ class LiveFusion:
     def _make_buffers(self, shape: tuple[int, int]) -> None:
         count, (height, width) = len(self.camera_ids), shape
         self._capacity = height * width
-        self._measured = Measured(
-            np.ones((count, height, width), np.float32), np.zeros((count, height, width), np.float32)
-        )
+        self._measured = np.full((count, height, width), NOTHING)
         self._present = np.zeros(count, np.uint8)
         self._counts = np.zeros(count, np.int64)
         self._starts = np.zeros(count + 1, np.int64)
@@ -198,9 +239,12 @@ class LiveFusion:
         self._panorama = np.zeros((*size, 3), np.uint8)
         self._panorama_depth = np.full(size, np.nan, np.float32)
         self._bands = range(0, size[1], _BAND_COLUMNS)
-        self._scratches: SimpleQueue[tuple[Scratch, Array32]] = SimpleQueue()
+        color_pixels = max(g.model.color.width * g.model.color.height for g in self._grids)
+        self._scratches: SimpleQueue[Scratch] = SimpleQueue()
+        self._strips: SimpleQueue[_Strip] = SimpleQueue()
         for _ in range(self.settings.threads):
-            self._scratches.put((_scratch(shape), np.zeros((6, size[0]), np.float32)))
+            self._scratches.put(_scratch(shape, color_pixels))
+            self._strips.put(_Strip.of_height(size[0]))
 
     def _in_threads(self, work: Callable[[int], None], items: Iterable[int]) -> None:
         for _ in self._pool.map(work, items):
@@ -221,40 +265,39 @@ class LiveFusion:
             return "its images are not of the size that its model states"
         kind = BAYER if frame.bayer is not None else _KIND[color.ndim]
         flat = np.ascontiguousarray(color).reshape(color.shape[0], -1)
-        return _Images(np.ascontiguousarray(depth), frame.raw is None, flat, kind)
+        size = color.shape[0], color.shape[1]
+        return _Images(np.ascontiguousarray(depth), frame.raw is None, flat, kind, size)
 
     def _clean(self, k: int, images: "_Images | None") -> None:
         self._present[k] = images is not None
         if images is None:  # its partners look here, too
-            self._measured.weight[k] = 0
+            self._measured[k] = NOTHING
             return
-        scratch, sums = self._scratches.get()
-        inverse_m, weight = self._measured.inverse[k], self._measured.weight[k]
-        clean_depth(
-            images.depth, images.in_mm, self._lenses[k], self._ring.scales[k], scratch, inverse_m, weight
-        )
-        self._scratches.put((scratch, sums))
+        scratch = self._scratches.get()
+        measured = self._measured[k]
+        clean_depth(images.depth, images.in_mm, self._lenses[k], self._ring.scales[k], scratch, measured)
+        self._scratches.put(scratch)
 
     def _place(self, k: int, images: "_Images | None") -> None:
         if images is None:
             self._counts[k] = 0
             return
-        scratch, sums = self._scratches.get()
+        scratch = self._scratches.get()
+        pack_colors(images.color, images.kind, self._gains[k], scratch.quads)
         own = slice(k * self._capacity, (k + 1) * self._capacity)
         self._counts[k] = place_points(
             k,
             self._measured,
             self._ring,
             self._drum,
-            images.color,
+            images.size,
             images.kind,
-            self._gains[k],
-            self._scans[k],
+            int(self._ring.scans[k]),
             scratch,
             self._points[own],
             self._colors[own],
         )
-        self._scratches.put((scratch, sums))
+        self._scratches.put(scratch)
 
     def _finish(self, first: int) -> None:
         """The cloud, or a band of columns of the panorama."""
@@ -262,27 +305,23 @@ class LiveFusion:
             np.cumsum(self._counts, out=self._starts[1:])
             close_ranks(self._points, self._colors, self._capacity, self._counts)
             return
-        scratch, sums = self._scratches.get()
+        scratch, strip = self._scratches.get(), self._strips.get()
         last = min(first + _BAND_COLUMNS, self.cylinder.width)
-        blend_columns(first, last, self._drum, self._present, sums, self._panorama, self._panorama_depth)
-        self._scratches.put((scratch, sums))
+        colors, depths = strip.colors[: last - first], strip.depths[: last - first]
+        blend_columns(first, last, self._drum, self._present, scratch.rows, colors, depths)
+        strip.write(self._panorama[:, first:last], self._panorama_depth[:, first:last])
+        self._scratches.put(scratch)
+        self._strips.put(strip)
 
 
-def _scratch(shape: tuple[int, int]) -> Scratch:
+def _scratch(shape: tuple[int, int], color_pixels: int) -> Scratch:
     return Scratch(
         inverse=np.zeros(shape, np.float32),
         likely=np.zeros(shape, np.float32),
         solid=np.zeros(shape, np.uint8),
         eroded=np.zeros(shape, np.uint8),
         columns=np.zeros(shape[1], np.int16),
-        rows=np.zeros((16, shape[1]), np.float32),
-        addresses=np.zeros((6, shape[1]), np.int32),
-        keys=np.zeros(shape[1], np.uint64),
-        ahead=np.full((2, shape[1] + 32), -1e9, np.float32),
+        rows=np.zeros(16 * PITCH, np.float32),
+        places=np.zeros(4 * PITCH, np.int32),
+        quads=np.zeros(color_pixels, np.uint32),
     )
-
-
-def _gain_table(gain: Gain | None) -> ImageU8:
-    """What the gain makes of every value (3,256) of red, green and blue."""
-    factors = np.ones(3) if gain is None else np.asarray(gain, dtype=np.float64)
-    return np.clip(np.rint(factors[:, None] * np.arange(256)), 0, 255).astype(np.uint8)

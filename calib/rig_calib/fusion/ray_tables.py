@@ -11,7 +11,7 @@ import numpy.typing as npt
 
 from rig_calib.depth_model import MAX_RANGE_M, MIN_RANGE_M, DepthCorrection, DepthGrid, depth_grid
 from rig_calib.fusion.cylinder import Cylinder, fit_cylinder
-from rig_calib.fusion.live_kernels import EMPTY, Drum, Lens, Ring
+from rig_calib.fusion.live_arrays import EMPTY, UNSEEN, Drum, Lens, Ring
 from rig_calib.fusion.visibility import in_field
 from rig_calib.projection import from_pixels, inside, pixel_rays, project
 from rig_protocol.camera import CameraModel, Intrinsics
@@ -26,7 +26,7 @@ _BLOCK_PX = 8  # shared views are found at every eighth pixel, and widened by as
 _RANGES_M = np.array([MIN_RANGE_M, 0.55, 0.8, 1.2, 2.0, 4.0, MAX_RANGE_M])
 _USUAL_RANGES_M = np.array([1.0, 2.0, 4.0])  # where the panorama's border is to be right
 _COLOR_RANGES_M = (0.55, MAX_RANGE_M)
-_HIDDEN = -1e4  # the colour pixel of what the colour camera cannot see
+_LARGEST = 32_000  # number in a table of 16 bits
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -77,7 +77,7 @@ class PlacedGrid:
         return np.asarray(scale / self.correction.factor(at[..., 0], at[..., 1]))
 
     def color_pixels(self) -> Array:
-        """(4,H,W): u, v, du, dv of the colour pixel (u, v) + (du, dv) / z.
+        """(4,H,W): u, v, du, dv of the colour pixel (u, v) + (du, dv) / z, NaN where none sees it.
 
         Straight in 1/z but for the lens's curvature over the parallax, a tenth of a pixel: a line through
         what is seen at 0.55 and at 8 m.
@@ -87,8 +87,6 @@ class PlacedGrid:
         near, far = (self._color_pixels_at(flat * range_m) for range_m in _COLOR_RANGES_M)
         slope = (near - far) / (1 / near_m - 1 / far_m)
         table = np.concatenate([far - slope / far_m, slope], axis=1).T.reshape(4, *self.shape)
-        unseen = ~np.isfinite(table).all(axis=0)
-        table[:, unseen] = np.array([_HIDDEN, _HIDDEN, 0.0, 0.0])[:, None]
         return np.asarray(table)
 
     def _color_pixels_at(self, points: Array) -> Array:
@@ -115,15 +113,22 @@ class PlacedGrid:
 def ring_tables(grids: Sequence[PlacedGrid]) -> Ring:
     """Tables of cameras whose depth images are of one size."""
     shape = grids[0].shape
-    rays = np.empty((len(grids), 3, *shape), np.float32)
+    tables = np.empty((len(grids), 6, *shape), np.int16)
+    planes = np.empty((len(grids), 6, 4), np.float32)
+    scans = np.empty(len(grids), np.int64)
     for i, grid in enumerate(grids):
-        rays[i] = (grid.rays() @ grid.T_rig_grid[:3, :3].T).transpose(2, 0, 1)
+        rays, color = grid.rays(), grid.color_pixels()
+        for k, values in enumerate((rays[..., 0], rays[..., 1], *color)):
+            planes[i, k], tables[i, k] = _from_plane(values)
+        scans[i] = 1 if float(np.nanmean(color[2])) > 0 else -1
+        tables[i, 2][~np.isfinite(color).all(axis=0)] = UNSEEN
     partners, spans = _shared_views(grids)
     return Ring(
         scales=np.array([grid.scale() for grid in grids], np.float32),
-        rays=np.nan_to_num(rays),
-        origins=np.array([grid.T_rig_grid[:3, 3] for grid in grids], np.float32),
-        color_pixels=np.array([grid.color_pixels() for grid in grids], np.float32),
+        tables=tables,
+        planes=planes,
+        scans=scans,
+        T_rig_grid=np.array([grid.T_rig_grid[:3] for grid in grids], np.float32),
         T_grid_rig=np.array([inverse(grid.T_rig_grid)[:3] for grid in grids], np.float32),
         lenses=np.array([_lens_numbers(grid.grid.intrinsics) for grid in grids], np.float32),
         partners=partners,
@@ -131,9 +136,22 @@ def ring_tables(grids: Sequence[PlacedGrid]) -> Ring:
     )
 
 
-def color_scan(table: Array32) -> int:
-    """Direction, ±1, along a depth row in which near things are ever farther behind in the colour image."""
-    return 1 if float(np.mean(table[2])) > 0 else -1
+def _from_plane(values: Array) -> tuple[Array, npt.NDArray[np.int16]]:
+    """c (4,) and a table (H,W) with values = c₀ + c₁ x + c₂ y + c₃ table, to a part in 65,000 of the rest."""
+    height, width = values.shape
+    known = np.isfinite(values)
+    if not known.any():
+        return np.zeros(4), np.zeros(values.shape, np.int16)
+    rows, columns = np.nonzero(known)
+    step = max(1, len(rows) // 10_000)  # a plane needs no more
+    design = np.stack([np.ones(len(rows)), columns, rows], axis=1)[::step]
+    plane = (
+        np.linalg.lstsq(design, values[known][::step], rcond=None)[0].astype(np.float32).astype(np.float64)
+    )
+    rest = values - (plane[0] + plane[1] * np.arange(width) + plane[2] * np.arange(height)[:, None])
+    rest = np.where(known, rest, 0.0)
+    unit = np.float32(max(float(np.abs(rest).max()) / _LARGEST, 1e-12))
+    return np.array([*plane, unit]), np.rint(rest / np.float64(unit)).astype(np.int16)
 
 
 def circle_around(grids: Sequence[PlacedGrid], T_view_rig: Pose, circle_px: int) -> Cylinder:

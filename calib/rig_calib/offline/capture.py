@@ -5,13 +5,13 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from rig_calib.recorded_calibration import recorded_calibration
-from rig_calib.recorded_panoramas import is_recording
+from rig_calib.recorded_panoramas import encoded_sets, is_recording
 from rig_calib.rig_calibration import RigCalibration
 from rig_calib.rig_folder_calibration import read_description
 from rig_protocol.decoding import decode_frame
 from rig_protocol.errors import ConfigurationError
 from rig_protocol.frames import EncodedFrame, PanoramicFrame, RgbdFrame
-from rig_protocol.recorded_sets import EncodedSet, with_frames
+from rig_protocol.recorded_sets import EncodedSet
 from rig_protocol.recording import Recording
 from rig_protocol.rig_folder import RigDescription, frame_indices, read_frame
 
@@ -53,7 +53,7 @@ def open_capture(path: Path) -> Capture:
     calibration = None
     if is_recording(path):
         recording = Recording(path)
-        marks = tuple(FrameMark(one.index, one.time_ns) for one in with_frames(recording.entries()))
+        marks = tuple(FrameMark(one.index, one.time_ns) for one in encoded_sets(recording))
         calibration = recorded_calibration(recording)
     else:
         held = (frame_indices(path, camera.name) for camera in description.cameras)
@@ -65,7 +65,7 @@ def open_capture(path: Path) -> Capture:
 
 def _recorded(take: Path, marks: Sequence[FrameMark]) -> Iterator[PanoramicFrame]:
     wanted = {mark.index for mark in marks}
-    for one in with_frames(Recording(take).entries()):
+    for one in encoded_sets(Recording(take)):
         if one.index in wanted:
             yield _decoded(one)
         if one.index >= marks[-1].index:

@@ -9,9 +9,10 @@ from rig_calib.coaching import PairSupport
 from rig_calib.drift.words import moved_message
 from rig_calib.rig_calibration import RigCalibration
 from rig_protocol.messages import Hello
+from rig_protocol.recorder import RecordingStatus
 from rig_server.health_history import QUANTITIES, HealthHistory
 from rig_server.histogram import HistogramSnapshot
-from rig_server.metrics import CameraMetrics, RecordingStatus, RigStatus
+from rig_server.metrics import CameraMetrics, RigStatus
 from rig_server.session_view import Phase, SessionView
 from rig_server.sinks.fuse import FusionReport
 from rig_server.status_words import alarms, summary

@@ -6,13 +6,9 @@ import signal
 import subprocess
 import sys
 import threading
-import time
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
-from types import TracebackType
-from typing import Self
 
 import numpy as np
 import pytest
@@ -20,10 +16,6 @@ import pytest
 from rig_agent.agent import Agent, _Hang
 from rig_agent.config import AgentSettings, PacingSettings
 from rig_agent.sources.base import (
-    ControlRefused,
-    ControlValue,
-    FrameSource,
-    SourceDescription,
     SourceLost,
 )
 from rig_protocol.camera import CameraModel, Intrinsics
@@ -35,74 +27,12 @@ from rig_protocol.rig_folder import CameraEntry, RigDescription, write_rig_folde
 from rig_protocol.rig_key import RigKey
 from rig_protocol.roster import Roster, Slot
 from support.loopback_server import LoopbackServer
-
-FPS = 100.0
-
-
-class FakeSource:
-    """A FrameSource of small frames, each filled with its number, as fast as `fps` says."""
-
-    def __init__(
-        self, serial: str = "A1", fps: float = FPS, trouble: Callable[[], None] = lambda: None
-    ) -> None:
-        self._serial, self._fps, self._trouble = serial, fps, trouble
-        self._number = 0
-        self.counters: Mapping[str, int] = {}
-        self.closed = False
-        self.done: list[tuple[str, ControlValue]] = []
-
-    def describe(self) -> SourceDescription:
-        return SourceDescription(self._serial, None, CameraModel(), FPS, "bayer", "raw")
-
-    def read(self, timeout_s: float) -> RgbdFrame | None:
-        self._trouble()
-        time.sleep(min(1 / self._fps, timeout_s))
-        number, self._number = self._number, self._number + 1
-        return make_frame(number)
-
-    def control(self, name: str, value: ControlValue) -> str:
-        if name == "die":
-            raise SourceLost("the device died of it")
-        if name == "sing":
-            raise ControlRefused("there is no control sing: it has tilt_deg")
-        self.done.append((name, value))
-        return f"{name} is {value}"
-
-    def close(self) -> None:
-        self.closed = True
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None, /
-    ) -> None:
-        self.close()
-
-
-def make_frame(number: int) -> RgbdFrame:
-    bayer = np.full((48, 64), number % 256, np.uint8)
-    raw = np.arange(48 * 64, dtype=np.uint16).reshape(48, 64) % 2048
-    return RgbdFrame(0, number, time.monotonic_ns(), bayer=bayer, raw=raw)
+from support.small_source import SmallSource, await_true, make_frame, running
 
 
 def make_settings(server: LoopbackServer, **changes: object) -> AgentSettings:
     host, port = server.address
     return AgentSettings.model_validate({"server": f"{host}:{port}", "camera": 5, **changes})
-
-
-@contextmanager
-def running(settings: AgentSettings, open_source: Callable[[], FrameSource]) -> Iterator[Agent]:
-    """An agent whose `run` is on a thread; stopped at the end."""
-    agent = Agent(settings, RigKey.INSECURE, open_source)
-    thread = threading.Thread(target=agent.run)
-    thread.start()
-    try:
-        yield agent
-    finally:
-        agent.stop()
-        thread.join(20)
-        assert not thread.is_alive()
 
 
 @pytest.fixture
@@ -111,14 +41,7 @@ def server() -> Iterator[LoopbackServer]:
         yield server
 
 
-def await_true(condition: Callable[[], bool]) -> None:
-    deadline = time.monotonic() + 20
-    while not condition():
-        assert time.monotonic() < deadline
-        time.sleep(0.01)
-
-
-class SwitchedSource(FakeSource):
+class SwitchedSource(SmallSource):
     """Delivers infrared images instead of Bayer from the fourth frame to the seventh."""
 
     def read(self, timeout_s: float) -> RgbdFrame | None:
@@ -137,7 +60,7 @@ def test_images_of_another_kind_than_agreed_are_left_out_and_end_no_agent(server
 
 
 def test_frames_arrive_bit_exact_under_the_agents_slot(server: LoopbackServer) -> None:
-    with running(make_settings(server), FakeSource):
+    with running(make_settings(server), SmallSource):
         server.wait_for(FrameReceived, 3)
     frame = server.frames()[2]
     assert (frame.camera_id, frame.damaged) == (5, False)
@@ -149,7 +72,7 @@ def test_frames_arrive_bit_exact_under_the_agents_slot(server: LoopbackServer) -
 
 
 def test_the_hello_says_who_the_camera_is(server: LoopbackServer) -> None:
-    with running(make_settings(server, name="door", fps=10.0), FakeSource):
+    with running(make_settings(server, name="door", fps=10.0), SmallSource):
         hello = server.wait_for(CameraJoined).hello
     assert (hello.name, hello.camera_id, hello.serial, hello.fps) == ("door", 5, "A1", 10.0)
     assert hello.software.startswith("kinect-rig ")
@@ -166,7 +89,7 @@ def test_the_hello_says_who_the_camera_is(server: LoopbackServer) -> None:
 def test_images_travel_as_the_settings_say(
     server: LoopbackServer, color: str, depth: str, names: tuple[str, str]
 ) -> None:
-    with running(make_settings(server, color=color, depth=depth), FakeSource):
+    with running(make_settings(server, color=color, depth=depth), SmallSource):
         frame = server.wait_for(FrameReceived).frame
     assert frame.color is not None
     assert frame.depth is not None
@@ -174,7 +97,7 @@ def test_images_travel_as_the_settings_say(
 
 
 def test_stopping_says_goodbye_and_closes_the_source(server: LoopbackServer) -> None:
-    source = FakeSource()
+    source = SmallSource()
     with running(make_settings(server), lambda: source):
         server.wait_for(FrameReceived)
     assert "goodbye" in server.wait_for(CameraLeft).text
@@ -183,7 +106,7 @@ def test_stopping_says_goodbye_and_closes_the_source(server: LoopbackServer) -> 
 
 @pytest.mark.parametrize("silently", [True, False])
 def test_the_agent_comes_back_when_the_server_restarts(server: LoopbackServer, silently: bool) -> None:
-    with running(make_settings(server), FakeSource) as agent:
+    with running(make_settings(server), SmallSource) as agent:
         server.wait_for(FrameReceived)
         server.stop(silently=silently)
         with LoopbackServer(server.address) as restarted:
@@ -195,7 +118,7 @@ def test_the_agent_comes_back_when_the_server_restarts(server: LoopbackServer, s
 def test_the_agent_may_start_before_the_server() -> None:
     with LoopbackServer() as first:
         address = first.address
-    with running(AgentSettings(server=f"127.0.0.1:{address[1]}", camera=5), FakeSource) as agent:
+    with running(AgentSettings(server=f"127.0.0.1:{address[1]}", camera=5), SmallSource) as agent:
         await_true(lambda: agent.totals.unheard > 0)
         with LoopbackServer(address) as server:
             server.wait_for(FrameReceived)
@@ -208,7 +131,7 @@ def test_a_lost_device_is_reopened_and_the_session_goes_on(server: LoopbackServe
         if next(reads) == 10:
             raise SourceLost("unplugged")
 
-    with running(make_settings(server), lambda: FakeSource(trouble=lose_once)) as agent:
+    with running(make_settings(server), lambda: SmallSource(trouble=lose_once)) as agent:
         server.wait_for(FrameReceived, 20)
         assert (agent.totals.source_losses, agent.totals.connections) == (1, 1)
     sequences = [frame.sequence for frame in server.frames()]
@@ -223,13 +146,13 @@ def test_another_device_in_its_place_says_hello_anew(server: LoopbackServer) -> 
         if next(reads) == 10:
             raise SourceLost("unplugged")
 
-    with running(make_settings(server), lambda: FakeSource(next(serials), trouble=lose_once)):
+    with running(make_settings(server), lambda: SmallSource(next(serials), trouble=lose_once)):
         assert server.wait_for(CameraJoined, 2).hello.serial == "B2"
 
 
 def test_frames_beyond_what_can_be_sent_are_dropped_and_counted(server: LoopbackServer) -> None:
     settings = make_settings(server, pacing=PacingSettings(spread=1.0, burst=1))
-    with running(settings, lambda: FakeSource(fps=100_000.0)) as agent:
+    with running(settings, lambda: SmallSource(fps=100_000.0)) as agent:
         server.wait_for(FrameReceived, 5)
         await_true(lambda: agent.totals.dropped > 20)
     totals = agent.totals
@@ -244,7 +167,7 @@ def test_what_no_retry_cures_ends_the_agent_with_a_goodbye(server: LoopbackServe
         if next(reads) == 30:
             raise DataError("color_003.png is torn")
 
-    agent = Agent(make_settings(server), RigKey.INSECURE, lambda: FakeSource(trouble=break_later))
+    agent = Agent(make_settings(server), RigKey.INSECURE, lambda: SmallSource(trouble=break_later))
     with pytest.raises(DataError, match=r"color_003.png is torn"):
         agent.run()
     assert "goodbye" in server.wait_for(CameraLeft).text
@@ -255,7 +178,7 @@ def test_a_refusal_is_told_once(caplog: pytest.LogCaptureFixture) -> None:
     with (
         caplog.at_level(logging.INFO),
         LoopbackServer(roster=roster) as server,
-        running(make_settings(server), FakeSource),
+        running(make_settings(server), SmallSource),
     ):
         server.wait_until(lambda: [None] if server.refusals >= 2 else [])
     refusals = [message for message in caplog.messages if "UNKNOWN_CAMERA" in message]
@@ -303,7 +226,7 @@ def test_neither_a_clock_that_jumps_an_hour_nor_a_stopped_program_is_a_hang(jump
 
 
 def test_a_control_of_the_camera_is_done_by_it_and_answered() -> None:
-    source = FakeSource()
+    source = SmallSource()
     with LoopbackServer() as server, running(make_settings(server), lambda: source):
         server.wait_for(FrameReceived)
         answer = server.control(5, "tilt_deg", 4.0)
@@ -316,10 +239,10 @@ def test_a_control_of_the_camera_is_done_by_it_and_answered() -> None:
 
 
 def test_a_control_that_the_device_dies_of_is_refused_and_the_source_opened_again() -> None:
-    opened: list[FakeSource] = []
+    opened: list[SmallSource] = []
 
-    def open_source() -> FakeSource:
-        opened.append(FakeSource())
+    def open_source() -> SmallSource:
+        opened.append(SmallSource())
         return opened[-1]
 
     with LoopbackServer() as server, running(make_settings(server), open_source):
@@ -332,10 +255,10 @@ def test_a_control_that_the_device_dies_of_is_refused_and_the_source_opened_agai
 
 
 def test_the_source_is_opened_again_where_the_operator_wants_it_whatever_source_it_is() -> None:
-    opened: list[FakeSource] = []
+    opened: list[SmallSource] = []
 
-    def open_source() -> FakeSource:
-        opened.append(FakeSource())
+    def open_source() -> SmallSource:
+        opened.append(SmallSource())
         return opened[-1]
 
     with LoopbackServer() as server, running(make_settings(server), open_source) as agent:
@@ -350,7 +273,7 @@ def test_the_log_level_is_set_and_a_word_that_is_none_refused() -> None:
     root = logging.getLogger()
     before = root.level
     try:
-        with LoopbackServer() as server, running(make_settings(server), FakeSource):
+        with LoopbackServer() as server, running(make_settings(server), SmallSource):
             server.wait_for(FrameReceived)
             assert server.control(5, "log_level", "debug").outcome is Outcome.DONE
             assert root.level == logging.DEBUG
@@ -360,7 +283,7 @@ def test_the_log_level_is_set_and_a_word_that_is_none_refused() -> None:
 
 
 def test_depth_that_a_server_switched_off_comes_on_again_when_that_server_has_gone() -> None:
-    source = FakeSource()
+    source = SmallSource()
     with LoopbackServer() as server, running(make_settings(server), lambda: source):
         server.wait_for(FrameReceived)
         server.control(5, "depth", False)
@@ -372,7 +295,7 @@ def test_depth_that_a_server_switched_off_comes_on_again_when_that_server_has_go
 
 def test_an_agent_that_is_told_to_restart_answers_first_and_ends_for_it() -> None:
     with LoopbackServer() as server:
-        agent = Agent(make_settings(server), RigKey.INSECURE, FakeSource)
+        agent = Agent(make_settings(server), RigKey.INSECURE, SmallSource)
         thread = threading.Thread(target=agent.run)
         thread.start()
         server.wait_for(FrameReceived)

@@ -114,6 +114,11 @@ def test_frames_pass_in_order(start: Start) -> None:
     assert [frame.sequence for frame in recorder.take(3)] == [0, 1, 2]
 
 
+def test_a_queue_tells_what_it_dropped() -> None:
+    queue: FrameQueue[int] = FrameQueue(2)
+    assert [queue.put(k) for k in range(4)] == [None, None, 0, 1]
+
+
 def test_a_lost_source_is_opened_again_and_frames_count_on(start: Start) -> None:
     capture, recorder = start([*frames(0, 1), SourceLost("unplugged")], frames(0, 1))
     assert [frame.sequence for frame in recorder.take(4)] == [0, 1, 2, 3]

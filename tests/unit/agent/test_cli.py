@@ -11,6 +11,8 @@ from typer.testing import CliRunner
 from rig_agent import cli
 from rig_agent.config import AgentSettings, load_agent_settings
 from rig_protocol.errors import ConfigurationError
+from rig_protocol.key_file import write_key
+from rig_protocol.rig_key import RigKey
 
 
 @pytest.fixture(autouse=True)
@@ -139,3 +141,24 @@ def test_the_agent_imports_no_calibration_code_and_none_of_its_libraries() -> No
     roots = {name.partition(".")[0] for name in done.stdout.split()}
     assert not roots & {"rig_calib", "rig_server", "scipy", "numba", "matplotlib"}
     assert "rig_agent" in roots
+
+
+def test_a_take_is_named_on_the_command_line(streamed: list[AgentSettings]) -> None:
+    invoke("--source", "synthetic", "--camera", "3", "--record", "take.mcap", "--server", "none")
+    (settings,) = streamed
+    assert (settings.record.path, settings.server, settings.address) == (Path("take.mcap"), "none", None)
+
+
+def test_who_records_needs_neither_server_nor_key_but_a_named_server_needs_one(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("rig_protocol.key_file.KEY_PLACES", (tmp_path / "rig.key",))
+    record = {"path": tmp_path}
+    for server in ("none", "auto"):
+        alone = AgentSettings.model_validate({"server": server, "record": record})
+        assert cli._key(alone) is None
+    for needing in ({"server": "pc", "record": record}, {"server": "auto"}):
+        with pytest.raises(ConfigurationError, match="this rig has no key"):
+            cli._key(AgentSettings.model_validate(needing))
+    write_key(tmp_path / "rig.key", key := RigKey(bytes(range(32))))
+    assert cli._key(AgentSettings.model_validate({"server": "auto", "record": record})) == key

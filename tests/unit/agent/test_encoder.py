@@ -1,9 +1,11 @@
 """Frames become payloads in the codecs that were chosen."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
-from rig_agent.encoder import encode_frame, fits
+from rig_agent.encoder import codecs_to_keep, encode_frame, fits
 from rig_protocol.codecs import codec_by_name
 from rig_protocol.errors import DataError
 from rig_protocol.frames import RgbdFrame
@@ -34,6 +36,22 @@ def test_each_image_is_encoded_in_its_codec() -> None:
     assert encoded.depth.codec_id == wire_id("disparity-uncompressed")
     np.testing.assert_array_equal(codec_by_name("bayer-lossless").decode(encoded.color.data), BAYER)
     np.testing.assert_array_equal(codec_by_name("disparity-uncompressed").decode(encoded.depth.data), RAW)
+
+
+def test_what_is_kept_is_lossless_whatever_the_network_wants() -> None:
+    color, depth = codecs_to_keep(FRAME, "jpeg", "lossless")
+    assert (color, depth) == (wire_id("bayer-lossless"), wire_id("disparity-lossless"))
+    color, depth = codecs_to_keep(replace(FRAME, bayer=None, color=BAYER), "raw", "raw")
+    assert (color, depth) == (wire_id("grey-uncompressed"), wire_id("disparity-uncompressed"))
+
+
+def test_what_was_encoded_for_one_use_is_not_encoded_again_for_another() -> None:
+    kept = encode_frame(FRAME, wire_id("bayer-lossless"), wire_id("disparity-lossless"))
+    sent = encode_frame(FRAME, wire_id("bgr-jpeg"), wire_id("disparity-lossless"), kept)
+    assert sent.depth is kept.depth
+    assert sent.color is not None
+    assert sent.color.codec_id == wire_id("bgr-jpeg")
+    assert encode_frame(FRAME, None, None, kept).color is None
 
 
 def test_a_stream_without_codec_is_not_sent() -> None:

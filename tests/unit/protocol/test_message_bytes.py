@@ -51,6 +51,7 @@ SIMPLE: list[Message] = [
     Resend(2**64 - 1, ((0, 1), (7, 3), (65535, 65535))),
     Resend(0, WHOLE_FRAME),
     StreamPlan(2, None, 14.5, 1_000_000, 999_999, 0.05, -(2**63)),
+    StreamPlan(2, None, 14.5, 1_000_000, 999_999, 0.05, 0, 2**63 - 1, "rig:0123456789abcdef"),
 ]
 
 
@@ -126,7 +127,6 @@ def test_the_longest_hello_is_one_datagram() -> None:
         {"color_codecs": (0,)},
         {"color_codecs": (256,)},
         {"color_codecs": tuple(range(1, 18))},
-        {"color_codecs": (), "depth_codecs": ()},
         {"ciphers": ()},
     ],
 )
@@ -224,6 +224,8 @@ PLAN: dict[str, Any] = {
         *({"phase_ns": phase_ns} for phase_ns in (1000, -1, None)),
         *({"spread": spread} for spread in (0.0, 1.01, math.nan, None)),
         *({"offset_ns": offset_ns} for offset_ns in (2**63, 0.5, None)),
+        *({"offset_uncertainty_ns": uncertainty_ns} for uncertainty_ns in (-1, 2**63, 0.5)),
+        *({"rig_clock": clock} for clock in ("", "x" * 33, 5, "red\x1b[31m")),
     ],
     ids=str,
 )

@@ -4,6 +4,7 @@ import io
 import struct
 from pathlib import Path
 
+import msgpack
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
@@ -22,7 +23,14 @@ from rig_protocol.recording import (
     part_path,
     recover,
 )
-from rig_protocol.recording_format import DroppedFrames, Entry, RecordedSet
+from rig_protocol.recording_format import (
+    ClockReading,
+    ClockTie,
+    DroppedFrames,
+    Entry,
+    EntryParser,
+    RecordedSet,
+)
 from rig_protocol.rig_folder import CameraEntry, RigDescription
 
 RIG = RigDescription((CameraEntry(0, "cam00", CameraModel()), CameraEntry(11, "front", CameraModel())))
@@ -72,6 +80,8 @@ def test_everything_comes_back_as_it_was(tmp_path: Path) -> None:
         frame(0, 43, received_ns=None, sequence=2**64 - 1),
         RecordedSet(30, 9_000_000_000, {0: None, 11: -5}),
         DroppedFrames(11, 3, -7, 9_000_000_001),
+        ClockReading(9_000_000_002, (ClockTie("rig:0123", -5, 0), ClockTie("utc", 2**62, 2**62))),
+        ClockReading(9_000_000_003, ()),
     ]
     write(tmp_path / "take.mcap", taken)
     recording = Recording(tmp_path / "take.mcap")
@@ -136,6 +146,25 @@ def test_a_damaged_chunk_is_refused_and_recover_leaves_it_out(tmp_path: Path) ->
     assert [entry for entry in taken if entry in kept] == kept
 
 
+@pytest.mark.parametrize(
+    "ties",
+    [
+        None,
+        [["utc", 1]],
+        ["utc"],
+        [["", 1, 2]],
+        [["x" * 33, 1, 2]],
+        [["utc", 2**63, 2]],
+        [["utc", 1, -2]],
+        [["utc", 1, 2]] * 9,
+    ],
+    ids=str,
+)
+def test_a_malformed_clock_is_refused_in_words(ties: object) -> None:
+    with pytest.raises(DataError, match="a message of /clock breaks the format"):
+        EntryParser().parse("/clock", msgpack.packb({"time_ns": 5, "ties": ties}))
+
+
 def test_parts_are_read_as_one_take(tmp_path: Path) -> None:
     taken, path = entries(), tmp_path / "take.mcap"
     write(path, taken[:45])
@@ -151,6 +180,17 @@ def test_reading_begins_where_it_is_asked_to(tmp_path: Path) -> None:
     write(path, taken)
     from_ns = 1_020_000_000 + 20 * 33_000_000
     assert list(Recording(path).entries(from_ns)) == taken[60:]
+
+
+def test_a_take_never_ends_before_it_begins(tmp_path: Path) -> None:
+    """Players divide by its length. Found by fuzzing: a chunk's header said the opposite."""
+    path, taken = tmp_path / "take.mcap", entries(3)
+    write(path, taken)
+    data, place = bytearray(path.read_bytes()), scan(path).chunks[0]
+    data[place.offset : place.offset + 16] = struct.pack("<QQ", place.end_ns, place.start_ns)
+    path.write_bytes(data)
+    assert Recording(path).start_ns <= Recording(path).end_ns
+    assert list(Recording(path).entries()) == taken
 
 
 @pytest.mark.parametrize("content", [b"", b"PNG", MAGIC[:5]])

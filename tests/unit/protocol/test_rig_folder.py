@@ -25,6 +25,7 @@ from rig_protocol.rig_folder import (
 from support.real_data import real_data
 
 RNG = np.random.default_rng(7)
+HUGE = "1" + "0" * 400
 COLOR = RNG.integers(0, 256, (48, 64, 3), dtype=np.uint8)
 RAW = RNG.integers(400, 1000, (48, 64), dtype=np.uint16)
 
@@ -111,6 +112,12 @@ def test_an_image_of_the_wrong_depth_is_refused(tmp_path: Path) -> None:
         ('{"cameras": [{}]}', "integer `id`"),
         ('{"cameras": [{"id": 0, "name": "../../etc"}]}', "plain folder name"),
         ('{"cameras": [{"id": 4, "color": {"fx": 1}}]}', "camera 4"),
+        ('{"cameras": [{"id": 1e400}]}', "integer `id`"),
+        (f'{{"cameras": [], "ring": {{"radius": {HUGE}}}}}', "ring must hold numbers"),
+        (
+            json.dumps({"cameras": [{"id": 0, **CameraModel().to_dict(), "T_rig_cam": [[10**400]]}]}),
+            "T_rig_cam must be",
+        ),
     ],
 )
 def test_a_malformed_description_says_where(tmp_path: Path, content: str, message: str) -> None:

@@ -229,8 +229,11 @@ def test_a_plan_comes_with_every_clock_request_once_the_clock_is_known() -> None
     peer = joined_peer(server)
     assert plans_of(server, peer, T0) == []
     server.plan_stream(0, CHOICE)
-    plans = [plans_of(server, peer, T0 + k * SECOND_NS // 2) for k in range(1, 4)]
-    assert plans == [[StreamPlan(COLOR, None, 15.0, 1_000_000, 250_000, 0.9, 5_000_123_456)]] * 3
+    server.rig_clock = "rig:0123"
+    plans = [plan for k in range(1, 4) for plan in plans_of(server, peer, T0 + k * SECOND_NS // 2)]
+    planned = StreamPlan(COLOR, None, 15.0, 1_000_000, 250_000, 0.9, 5_000_123_456, rig_clock="rig:0123")
+    assert [replace(plan, offset_uncertainty_ns=None) for plan in plans] == [planned] * 3
+    assert all(0 < (plan.offset_uncertainty_ns or 0) < 100_000 for plan in plans)
 
 
 def test_a_plan_is_for_the_session_that_it_was_made_for() -> None:

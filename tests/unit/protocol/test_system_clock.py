@@ -2,10 +2,12 @@
 
 import math
 import time
+from pathlib import Path
 
 import pytest
 
-from rig_protocol.system_clock import KernelClock, SystemClock, kernel_clock
+from rig_protocol import system_clock
+from rig_protocol.system_clock import KernelClock, SystemClock, boot_clock_name, kernel_clock
 
 SECOND_NS = 1_000_000_000
 WALL_MINUS_MONOTONIC_NS = 1_700_000_000 * SECOND_NS
@@ -48,6 +50,14 @@ class Machine:
             errors.append(self.clock.read().error_ns)
             self.now_ns += SECOND_NS // 2
         return errors
+
+
+def test_the_monotonic_clock_is_named_after_the_boot(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    boot_id = tmp_path / "boot_id"
+    monkeypatch.setattr(system_clock, "_BOOT_ID", boot_id)
+    assert boot_clock_name() is None
+    boot_id.write_text("4e6c8943-8d49-4b9b-a633-c2a18ad5a104\n")
+    assert boot_clock_name() == "rig:4e6c89438d494b9b"
 
 
 def test_the_clocks_are_read_at_one_instant_even_when_the_reader_is_interrupted() -> None:

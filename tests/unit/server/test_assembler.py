@@ -6,9 +6,9 @@ import time
 import pytest
 
 from rig_protocol.frames import PanoramicFrame, RgbdFrame
+from rig_protocol.synchroniser import Policy, Synchroniser
 from rig_server import assembler as assembler_module
 from rig_server.assembler import Assembler, SetRecord
-from rig_server.synchroniser import Policy, Synchroniser
 
 MS = 1_000_000
 

@@ -14,6 +14,7 @@ from rig_calib.recorded_calibration import calibration_for
 from rig_calib.rig_calibration import RigCalibration
 from rig_protocol.errors import ConfigurationError, DataError
 from rig_protocol.frames import PanoramicFrame
+from rig_protocol.recorder import TakeContext
 from rig_protocol.recording import CALIBRATION, Recording
 from rig_server import Rig
 from rig_server.config import RigSettings, WatchSettings
@@ -189,7 +190,7 @@ def test_a_document_is_written_again_only_when_it_is_another_one(tmp_path: Path)
         asked.release()
         return dict(documents)
 
-    sink = RecordSink(tmp_path / "take.mcap", RigSettings().recording, ask, dict)
+    sink = RecordSink(tmp_path / "take.mcap", RigSettings().recording, TakeContext(ask))
     sink.start()
     for _ in range(2):
         assert asked.acquire(timeout=30)

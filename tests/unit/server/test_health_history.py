@@ -7,8 +7,9 @@ import numpy as np
 import pytest
 
 from rig_calib.drift.watch import CameraDrift, DriftStatus
+from rig_protocol.recorder import RecordingStatus
 from rig_server.health_history import QUANTITIES, HealthHistory
-from rig_server.metrics import CameraMetrics, DriftReport, RecordingStatus, RigStatus
+from rig_server.metrics import CameraMetrics, DriftReport, RigStatus
 from support.full_status import full_status
 
 

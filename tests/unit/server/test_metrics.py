@@ -8,11 +8,11 @@ from typing import Any
 import pytest
 from rich.console import Console
 
+from rig_protocol.synchroniser import IncompleteSet
 from rig_server.assembler import SetRecord
 from rig_server.live_table import LiveDisplay, status_line, status_table
 from rig_server.metrics import CameraMetrics, RateMeter, RigStatus, summarise_sets
 from rig_server.sample_window import SampleWindow
-from rig_server.synchroniser import IncompleteSet
 from support.full_status import full_status
 
 S = 1_000_000_000

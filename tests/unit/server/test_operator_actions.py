@@ -10,8 +10,9 @@ import pytest
 from rig_protocol.errors import ConfigurationError, RigError
 from rig_protocol.events import ControlAnswered, Outcome
 from rig_protocol.messages import ControlValue
+from rig_protocol.recorder import RecordingStatus
 from rig_server.config import RecordingSettings, RigSettings
-from rig_server.metrics import CameraMetrics, RecordingStatus, RigStatus
+from rig_server.metrics import CameraMetrics, RigStatus
 from rig_server.operator_actions import RigActions
 from rig_server.session_view import Phase, SessionView
 

@@ -10,10 +10,10 @@ from rig_protocol.errors import ConfigurationError, DataError, RigError
 from rig_protocol.frames import EncodedFrame, PanoramicFrame
 from rig_protocol.recording import DESCRIPTION, HELLOS, Recording, RecordingWriter, recover
 from rig_protocol.recording_format import RecordedSet
-from rig_server import Rig, replay
-from rig_server.config import RigSettings
+from rig_server import Rig, pace
+from rig_server.config import RecordingSettings, RigSettings
 from rig_server.replay import ReplayOptions
-from support.takes import SETTINGS, record_take, same_set
+from support.takes import SETTINGS, record_take, same_images, same_set
 
 FASTEST = ReplayOptions(speed=None)
 
@@ -70,8 +70,8 @@ def test_live_speed_gives_a_set_when_it_is_due(
         nonlocal now_s
         now_s += seconds
 
-    monkeypatch.setattr(replay.time, "monotonic", lambda: now_s)  # type: ignore[attr-defined]
-    monkeypatch.setattr(replay.time, "sleep", sleep)  # type: ignore[attr-defined]
+    monkeypatch.setattr(pace.time, "monotonic", lambda: now_s)  # type: ignore[attr-defined]
+    monkeypatch.setattr(pace.time, "sleep", sleep)  # type: ignore[attr-defined]
     for speed in (1.0, 4.0):
         now_s = 0.0
         with Rig.replayed(path, RigSettings(), ReplayOptions(speed)) as rig:
@@ -79,13 +79,59 @@ def test_live_speed_gives_a_set_when_it_is_due(
         assert now_s == pytest.approx((times[-1] - times[0]) / 1e9 / speed, rel=1e-6)
 
 
-def test_a_loop_begins_again_and_counts_on(take: tuple[Path, list[PanoramicFrame]]) -> None:
+def test_a_loop_begins_again_and_indices_and_times_go_on(take: tuple[Path, list[PanoramicFrame]]) -> None:
     path, live = take
     with Rig.replayed(path, RigSettings(), ReplayOptions(None, loop=True)) as rig:
         sets = list(islice(rig, 2 * len(live) + 3))
-    assert all_same(sets, [*live, *live, *live[:3]])
+    assert all_same(sets[: len(live)], live)
+    assert all(map(same_images, sets, [*live, *live, *live[:3]]))
     indices = [one.index for one in sets]
     assert indices == sorted(set(indices))
+    for camera_id in live[0].frames:
+        frames = [frame for one in sets if (frame := one.frames[camera_id]) is not None]
+        times = [frame.timestamp_ns for frame in frames]
+        assert times == sorted(set(times))
+
+
+def test_what_is_played_can_be_recorded_and_plays_the_same(
+    take: tuple[Path, list[PanoramicFrame]], tmp_path: Path
+) -> None:
+    """However fast it is played: the play waits for the disk. Names, times and date are the first take's."""
+    path, live = take
+    copy = tmp_path / "copy.mcap"
+    settings = SETTINGS.model_copy(update={"recording": RecordingSettings(queue_mib=8)})
+    with Rig.replayed(path, settings, FASTEST, record=copy) as rig:
+        given = list(rig)
+        while (status := rig.status().recording) is not None and status.waiting_bytes:
+            rig.next_panorama(0.01)
+        assert status is not None
+        assert status.dropped == 0
+    assert all_same(given, live)
+    assert all_same(played(copy), live)
+    first, second = Recording(path), Recording(copy)
+    assert second.clock == first.clock
+    assert second.document(DESCRIPTION) == first.document(DESCRIPTION)
+    assert first.utc_minus_rig_time_ns is not None
+    assert second.utc_minus_rig_time_ns == pytest.approx(first.utc_minus_rig_time_ns, abs=2e9)
+    assert encoded(copy).items() <= encoded(path).items()
+
+
+def test_a_part_of_a_take_is_cut_by_seeking_and_ending_the_recording(
+    take: tuple[Path, list[PanoramicFrame]], tmp_path: Path
+) -> None:
+    path, live = take
+    with Rig.replayed(path, SETTINGS, FASTEST) as rig:
+        for _ in range(4):
+            rig.next_panorama(5.0)
+        rig.start_recording(tmp_path / "part.mcap")
+        with pytest.raises(RigError, match="is being recorded"):
+            rig.start_recording(tmp_path / "other.mcap")
+        for _ in range(5):
+            rig.next_panorama(5.0)
+        status = rig.stop_recording()
+        assert status is not None
+        assert status.frames > 0
+    assert all_same(played(tmp_path / "part.mcap"), live[4:9])
 
 
 def test_seek_leaves_out_what_came_before_and_nothing_of_a_set(
@@ -98,6 +144,12 @@ def test_seek_leaves_out_what_came_before_and_nothing_of_a_set(
     assert all_same(played(path, ReplayOptions(None, seek_s=seek_s - 1e-6)), live[8:])
     with pytest.raises(ConfigurationError, match="lasts"):
         Rig.replayed(path, RigSettings(), ReplayOptions(seek_s=1e6))
+
+
+def encoded(path: Path) -> dict[tuple[int, int], bytes | None]:
+    """Depth as it was sent, by camera and time."""
+    frames = [entry for entry in Recording(path).entries() if isinstance(entry, EncodedFrame)]
+    return {(f.camera_id, f.timestamp_ns): f.depth and bytes(f.depth.data) for f in frames}
 
 
 def rewrite(path: Path, source: Path, keep: type | tuple[type, ...], finish: bool = True) -> None:

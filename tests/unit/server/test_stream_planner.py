@@ -117,6 +117,17 @@ def test_agents_on_this_machine_load_no_port(host: str) -> None:
 # ---- refusals
 
 
+def test_a_camera_that_only_records_takes_no_share_and_is_told_a_plan_for_its_clock() -> None:
+    made = PlannedRig(StreamPlanner(LinkSettings(speed_mbit=100)), OFFICE)
+    made.join(2)
+    load = made.planner.demand.wire_bytes_s
+    silent = made.join(2, replace(KINECT, color_codecs=(), depth_codecs=()), first=2)
+    assert (made.planner.demand.cameras, made.planner.demand.wire_bytes_s) == (2, load)
+    for one in silent:
+        assert isinstance(one, StreamChoice)
+        assert (one.color_codec, one.depth_codec) == (None, None)
+
+
 def test_without_adaptation_what_cannot_fit_is_refused_with_what_would() -> None:
     planner = StreamPlanner(LinkSettings(speed_mbit=500, adapt=False), 12)
     refusal = planner.camera_joined(0, KINECT, AWAY, 0)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from rig_protocol.frames import RgbdFrame
-from rig_server.synchroniser import Synchroniser
+from rig_protocol.synchroniser import Synchroniser
 from support.frame_streams import (
     DEADLINE_NS,
     LATENCY_NS,

@@ -9,11 +9,11 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Literal
 
+from rig_protocol.camera_queue import CameraQueue
 from rig_protocol.frames import PanoramicFrame, RgbdFrame
-from rig_server.camera_queue import CameraQueue
-from rig_server.latest_policy import LatestPolicy
-from rig_server.rig_queues import RigQueues, SynchroniserCounters
-from rig_server.waiting_policy import WaitingPolicy
+from rig_protocol.latest_policy import LatestPolicy
+from rig_protocol.rig_queues import RigQueues, SynchroniserCounters
+from rig_protocol.waiting_policy import WaitingPolicy
 
 Policy = Literal["partial", "strict", "latest"]
 """Which sets go out, and when."""

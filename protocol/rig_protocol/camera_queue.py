@@ -3,8 +3,8 @@
 from bisect import insort
 from typing import NamedTuple
 
+from rig_protocol.frame_rate import FrameRate
 from rig_protocol.frames import RgbdFrame
-from rig_server.frame_rate import FrameRate
 
 # Frames that may wait for one camera: a deadline of 200 ms at 30 Hz, and 8 × 0.9 MB of memory.
 MAX_PENDING = 8

@@ -3,9 +3,9 @@
 from dataclasses import dataclass
 from statistics import median_low
 
+from rig_protocol.camera_queue import MAX_PENDING, NEVER_NS, CameraQueue
+from rig_protocol.frame_rate import period_of
 from rig_protocol.frames import RgbdFrame
-from rig_server.camera_queue import MAX_PENDING, NEVER_NS, CameraQueue
-from rig_server.frame_rate import period_of
 
 
 @dataclass(slots=True)

@@ -7,9 +7,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from rig_protocol.camera_queue import MAX_PENDING
 from rig_protocol.frames import RgbdFrame
-from rig_server.camera_queue import MAX_PENDING
-from rig_server.synchroniser import Policy, Synchroniser
+from rig_protocol.synchroniser import Policy, Synchroniser
 from support.frame_streams import (
     DEADLINE_NS,
     MS,

@@ -5,7 +5,7 @@ import dataclasses
 import numpy as np
 import pytest
 
-from rig_server.synchroniser import Policy
+from rig_protocol.synchroniser import Policy
 from support.frame_streams import (
     DEADLINE_NS,
     MS,

@@ -2,7 +2,7 @@
 
 import errno
 import tempfile
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import IO, Any
@@ -10,7 +10,6 @@ from typing import IO, Any
 from rig_protocol.errors import ConfigurationError
 from rig_protocol.recording import RecordingWriter, part_path
 from rig_protocol.recording_format import Entry
-from rig_server.receiver import rig_time_ns
 
 # Holds the chunk in progress (6 MiB at most), what is to be written behind it, and the indexes of 30 GiB.
 _RESERVE_BYTES = 16 << 20
@@ -72,10 +71,22 @@ class DiskFile:
 
 
 class TakeFile:
-    """A take in parts of about `part_bytes`; one thread at a time. OSError when the disk fails."""
+    """A take in parts of about `part_bytes`; one thread at a time. OSError when the disk fails.
 
-    def __init__(self, path: Path, part_bytes: float) -> None:
+    `now_ns` reads the clock of its times, `clock` is that clock's name. `moment` tells UTC together with a
+    clock that is not this machine's.
+    """
+
+    def __init__(
+        self,
+        path: Path,
+        part_bytes: float,
+        now_ns: Callable[[], int],
+        clock: str | None = None,
+        moment: Callable[[], tuple[str, int]] | None = None,
+    ) -> None:
         self._path, self._part_bytes = path, part_bytes
+        self._now_ns, self._clock, self._moment = now_ns, clock, moment or self._now
         self._number, self._before = 0, 0
         self._documents: Mapping[str, Any] = {}
         self._attached: dict[str, Any] = {}
@@ -115,17 +126,20 @@ class TakeFile:
 
     def _open(self) -> None:
         self._disk = DiskFile(part_path(self._path, self._number))
-        created = datetime.now(UTC).isoformat(timespec="seconds")
-        self._writer = RecordingWriter(self._disk, created, rig_time_ns())
+        created, now_ns = self._moment()
+        self._writer = RecordingWriter(self._disk, created, now_ns, self._clock)
         self._attached.clear()
         self._attach()
+
+    def _now(self) -> tuple[str, int]:
+        return datetime.now(UTC).isoformat(timespec="seconds"), self._now_ns()
 
     def _attach(self) -> None:
         for name, values in self._documents.items():
             if self._attached.get(name) is not values:  # writing a calibration as JSON takes some ms
-                self._writer.attach(name, values, rig_time_ns())
+                self._writer.attach(name, values, self._now_ns())
                 self._attached[name] = values
 
     def _finish_part(self, cameras: Mapping[str, Mapping[str, int]]) -> None:
-        self._writer.finish(cameras, rig_time_ns())
+        self._writer.finish(cameras, self._now_ns())
         self._disk.close()

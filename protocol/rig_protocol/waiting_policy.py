@@ -9,9 +9,9 @@ the price of one frame of that camera, and why a slow camera is not waited for w
 
 from collections.abc import Sequence
 
+from rig_protocol.camera_queue import CameraQueue, Head
 from rig_protocol.frames import RgbdFrame, mean_time_ns
-from rig_server.camera_queue import CameraQueue, Head
-from rig_server.rig_queues import RigQueues
+from rig_protocol.rig_queues import RigQueues
 
 # A move of the cut costs frames. In the first sets after a camera joined or left it is worth this gain of
 # spread, in periods (above the jitter of software time stamps), and once in so many sets later on ...

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from rig_server.frame_rate import FrameRate, period_of
+from rig_protocol.frame_rate import FrameRate, period_of
 
 PERIOD_NS = 33_333_333
 

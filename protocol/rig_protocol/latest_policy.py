@@ -2,9 +2,9 @@
 
 from collections.abc import Mapping, Sequence
 
+from rig_protocol.camera_queue import CameraQueue
 from rig_protocol.frames import RgbdFrame, mean_time_ns
-from rig_server.camera_queue import CameraQueue
-from rig_server.rig_queues import RigQueues
+from rig_protocol.rig_queues import RigQueues
 
 # A frame counts for so many periods of its camera: the next one is then half a period late.
 _COUNTS_PERIODS = 1.5
