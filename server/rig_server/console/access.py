@@ -58,6 +58,7 @@ class Gate:
         if not self.is_token(request.cookies.get(self.cookie, "")):
             return "this console wants its token: open the link that rig-server printed when it started"
         harmless = request.method in _SAFE_METHODS and "Upgrade" not in request.headers
-        if harmless or request.headers.get("Origin") == f"{request.scheme}://{request.host}":
+        # Either scheme: there may be a proxy that speaks TLS in front of us.
+        if harmless or request.headers.get("Origin") in (f"http://{request.host}", f"https://{request.host}"):
             return None
         return "the console takes orders from its own page alone"

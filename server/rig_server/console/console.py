@@ -221,16 +221,18 @@ class RigConsole:
         return guide
 
     def _show(self, fused: FusedFrame) -> None:
-        if not self._server.watched:
+        modes = self._server.modes
+        if not modes:
             return
         self._scene.show(fused)
-        strips = (
-            (_strip(fused.panorama), (Mode.COLOR, Mode.OVERLAP)),
-            (_strip(distance_picture(fused.panorama_depth_m)), (Mode.DEPTH,)),
-        )
-        for strip, modes in strips:
-            header = {"kind": "panorama", "width": strip.shape[1], "height": strip.shape[0]}
-            self._server.publish("panorama", picture_message(header, [jpeg(strip)]), modes)
+        if modes != {Mode.DEPTH}:
+            self._publish_strip(fused.panorama, (Mode.COLOR, Mode.OVERLAP))
+        if Mode.DEPTH in modes:
+            self._publish_strip(distance_picture(fused.panorama_depth_m), (Mode.DEPTH,))
+
+    def _publish_strip(self, image: ImageU8, modes: tuple[Mode, ...]) -> None:
+        message = picture_message({"kind": "panorama"}, [jpeg(_strip(image))])
+        self._server.publish("panorama", message, modes)
 
     def _place_cameras(self) -> None:
         """Draw the cameras where the calibration has them, when it is another one."""

@@ -99,7 +99,12 @@ class WebServer:
     @property
     def watched(self) -> bool:
         """Whether anybody looks at all."""
-        return any(viewer.look is not None for viewer in list(self._viewers))
+        return bool(self.modes)
+
+    @property
+    def modes(self) -> frozenset[Mode]:
+        """In which modes anybody looks."""
+        return frozenset(look.mode for viewer in list(self._viewers) if (look := viewer.look) is not None)
 
     def __enter__(self) -> Self:
         """Begin."""
