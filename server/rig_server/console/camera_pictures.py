@@ -65,17 +65,17 @@ def depth_picture(frame: RgbdFrame, raw_model: RawDepthModel, full: bool) -> Ima
     step = 1 if full else 2
     if frame.raw is not None:
         disparity = np.minimum(frame.raw[::step, ::step], NO_DISPARITY)
-        return np.asarray(_raw_table(raw_model)[disparity], np.uint8)
+        return _painted(_raw_levels(raw_model)[disparity])
     if frame.depth_mm is None:
         return None
     depth: ImageU16 = frame.depth_mm[::step, ::step] // np.uint16(_MM_STEP)
-    return np.asarray(_MM_TABLE[np.minimum(depth, _TABLE_SIZE - 1)], np.uint8)
+    return _painted(_MM_LEVELS[np.minimum(depth, _TABLE_SIZE - 1)])
 
 
 def distance_picture(distance_m: npt.NDArray[np.float32]) -> ImageU8:
     """The same of distances (H,W) in metres, NaN where nothing was measured."""
     steps = np.nan_to_num(distance_m * (1000.0 / _MM_STEP), nan=0.0, posinf=0.0).astype(np.int32)
-    return np.asarray(_MM_TABLE[np.clip(steps, 0, _TABLE_SIZE - 1)], np.uint8)
+    return _painted(_MM_LEVELS[np.clip(steps, 0, _TABLE_SIZE - 1)])
 
 
 def jpeg(image: ImageU8) -> bytes:
@@ -99,25 +99,36 @@ def _resized(image: ImageU8, size: tuple[int, int]) -> ImageU8:
     return np.asarray(cv2.resize(image, size, interpolation=cv2.INTER_NEAREST), np.uint8)
 
 
-def _table(depth_m: npt.NDArray[np.float64]) -> ImageU8:
-    """Colours (N,3) of depths; those that are not positive are nothing."""
+def _painted(levels: ImageU8) -> ImageU8:
+    """Colours (H,W,3) of levels (H,W)."""
+    return np.asarray(cv2.applyColorMap(levels, _COLORS), np.uint8)
+
+
+def _levels(depth_m: npt.NDArray[np.float64]) -> ImageU8:
+    """Levels (N,) of depths, 1 far to 255 near; 0 for those that are not positive."""
     known = np.isfinite(depth_m) & (depth_m > 0)
     # Between equal steps of depth and of disparity: near and far can both be told apart.
     inverse_m = 1 / np.where(known, depth_m, _FAR_M)
     nearness = np.sqrt(np.clip((inverse_m - 1 / _FAR_M) / (1 / _NEAR_M - 1 / _FAR_M), 0, 1))
-    levels = np.clip(np.rint(255 * (0.06 + 0.88 * nearness)), 0, 255).astype(np.uint8)
-    colors = np.asarray(cv2.applyColorMap(levels[:, None], cv2.COLORMAP_TURBO), np.uint8)[:, 0]
-    colors[~known] = _NOTHING_BGR
+    return np.where(known, np.rint(1 + 254 * nearness), 0).astype(np.uint8)
+
+
+def _colors() -> ImageU8:
+    """Colours (256,1,3) of levels: Turbo without its dark ends, which would look like nothing."""
+    ramp = np.rint(np.linspace(15, 240, 256)).astype(np.uint8)
+    colors = np.asarray(cv2.applyColorMap(ramp[:, None], cv2.COLORMAP_TURBO), np.uint8)
+    colors[0] = _NOTHING_BGR
     return colors
 
 
-_MM_TABLE = _table(np.arange(_TABLE_SIZE, dtype=np.float64) * (_MM_STEP / 1000.0))
+_COLORS = _colors()
+_MM_LEVELS = _levels(np.arange(_TABLE_SIZE, dtype=np.float64) * (_MM_STEP / 1000.0))
 
 
 @lru_cache(maxsize=256)
-def _raw_table(model: RawDepthModel) -> ImageU8:
-    """Colours of all disparities; the last means none."""
+def _raw_levels(model: RawDepthModel) -> ImageU8:
+    """Levels of all disparities; the last means none."""
     with np.errstate(divide="ignore"):
         depth_m = model.numerator_m / (model.offset - np.arange(_TABLE_SIZE, dtype=np.float64))
     depth_m[-1] = 0.0
-    return _table(depth_m)
+    return _levels(depth_m)

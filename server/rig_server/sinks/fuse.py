@@ -58,7 +58,7 @@ class FuseSink:
 
     def report(self) -> FusionReport:
         """How it goes; any thread may ask."""
-        report = replace(self._report, passed_over=self._worker.replaced)
+        report = replace(self._report, passed_over=self._worker.passed)
         return report if self._worker.failure is None else replace(report, trouble=self._worker.failure)
 
     def start(self) -> None:

@@ -49,7 +49,7 @@ def test_of_items_that_come_meanwhile_the_last_alone_is_worked_on(
     for _ in range(2):
         assert gated.done.acquire(timeout=10)
     assert gated.items == [1, 4]
-    assert worker.replaced == 2
+    assert worker.passed == 2
 
 
 def test_an_error_is_told_until_work_goes_well_again(
@@ -65,7 +65,7 @@ def test_an_error_is_told_until_work_goes_well_again(
     assert caplog.text.count("test has failed") == 1
 
 
-def test_works_begin_no_sooner_after_another_than_was_asked_for() -> None:
+def test_what_is_offered_too_soon_after_the_work_before_passes() -> None:
     done = threading.Semaphore(0)
     worker = LatestOnly[int]("test", lambda _: done.release(), 3600.0, 0)
     worker.start()
@@ -73,7 +73,7 @@ def test_works_begin_no_sooner_after_another_than_was_asked_for() -> None:
     assert done.acquire(timeout=10)
     worker.offer(2)
     worker.offer(3)
-    assert worker.replaced == 1  # the second waits for its time
+    assert worker.passed == 2
     worker.stop()
     assert not done.acquire(blocking=False)
 
