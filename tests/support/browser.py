@@ -7,13 +7,8 @@ from pathlib import Path
 
 from playwright.sync_api import Browser, sync_playwright
 
-# The last two draw WebGL in software.
-_FLAGS = (
-    "--no-sandbox",
-    "--disable-background-networking",
-    "--use-angle=swiftshader",
-    "--enable-unsafe-swiftshader",
-)
+_FLAGS = ("--no-sandbox", "--disable-background-networking")
+_WEBGL_FLAGS = ("--use-angle=swiftshader", "--enable-unsafe-swiftshader")
 
 
 def chromium_path() -> Path | None:
@@ -23,10 +18,11 @@ def chromium_path() -> Path | None:
 
 
 @contextmanager
-def browser(path: Path) -> Iterator[Browser]:
-    """A running headless Chromium."""
+def browser(path: Path, webgl: bool = True) -> Iterator[Browser]:
+    """A running headless Chromium. With `webgl` all that it shows goes through a GPU made of software."""
+    flags = (*_FLAGS, *(_WEBGL_FLAGS if webgl else ("--disable-gpu",)))
     with sync_playwright() as playwright:
-        chromium = playwright.chromium.launch(executable_path=path, args=list(_FLAGS))
+        chromium = playwright.chromium.launch(executable_path=path, args=list(flags))
         try:
             yield chromium
         finally:
