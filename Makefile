@@ -51,8 +51,11 @@ bench-transport: $(BENCH) bench-codecs  ## the transport against its bars and it
 bench-calibration: $(BENCH)  ## the calibration against its bars, the bound and its peers, into docs/accuracy.md
 	$(BIN)/python tests/benchmarks/bench_calibration.py
 
-bench-fusion: $(READY) build/open3d  ## the live fusion against its bars and Open3D, into docs/performance.md
+bench-fusion: $(READY) build/open3d  ## live fusion and meshes against their bars and Open3D, into docs/
 	$(BIN)/python tests/benchmarks/bench_fusion.py
+	$(BIN)/python tests/benchmarks/bench_recording.py
+	$(BIN)/python tests/benchmarks/surface_error.py
+	$(BIN)/python tests/benchmarks/offline_scaling.py
 
 # In a folder of its own: it brings a pytest plugin that the tests' settings refuse. Without it the bench skips it.
 build/open3d: $(READY)

@@ -6,7 +6,12 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 if TYPE_CHECKING:  # heavy: imported where they are used, so that --help is quick
+    from collections.abc import Mapping
+
     from rich.console import Console
+
+    from rig_calib.fusion.gains import Gain
+    from rig_calib.rig_calibration import RigCalibration
 
 Folder = Annotated[
     Path, typer.Argument(help="Rig folder (nominal.json, one subfolder a camera), or a recording FILE.mcap.")
@@ -35,6 +40,12 @@ _EXPORT_EXAMPLES = """
 `rig-calib export results/calibration.json --format ros2 --out rig.launch.py` — the calibration, for a program
 
 `rig-calib export take.mcap --format foxglove --out view.mcap` — images, cloud and transforms, for Foxglove
+
+`rig-calib export take.mcap --format rig-folder --out rig --frames 5` — a rig folder, for `rig-calib solve`
+
+`rig-calib export take.mcap --format ply --out clouds --workers 4` — four processes of this machine
+
+`rig-calib export /nfs/take.mcap --format ply --out /nfs/clouds --scheduler tcp://10.0.0.1:8786` — a cluster
 """
 
 
@@ -43,6 +54,10 @@ def fuse(
     out: Out,
     calibration: Calibration = None,
     frames: Frames = None,
+    mesh: Annotated[bool, typer.Option("--mesh", help="Write mesh.ply and mesh.glb, too.")] = False,
+    voxel_mm: Annotated[float, typer.Option(min=2, max=100, help="Of the mesh: how fine it is.")] = 10.0,
+    workers: WorkerCount = None,
+    scheduler: Scheduler = None,
 ) -> None:
     """Fuse a rig folder or a recording with a calibration into cloud.ply and panorama.png."""
     from rich.console import Console
@@ -50,7 +65,10 @@ def fuse(
     from rig_calib.outputs import make_output_folder, write_fused
     from rig_calib.recorded_calibration import calibration_for
     from rig_calib.rig_folder_calibration import read_description, read_views
+    from rig_calib.tsdf.mesh_files import require_libraries
 
+    if mesh:
+        require_libraries()
     known = calibration_for(folder, calibration)
     views = read_views(folder, read_description(folder), frames)
     make_output_folder(out)
@@ -59,6 +77,39 @@ def fuse(
     console.print(f"{len(fused.cloud):,} points in {out / 'cloud.ply'}")
     for why in fused.cloud.skipped:
         console.print(why, style="yellow")
+    if mesh:
+        _fuse_mesh(console, folder, known, fused.gains, out, frames, voxel_mm * 1e-3, workers, scheduler)
+
+
+def _fuse_mesh(
+    console: "Console",
+    path: Path,
+    known: "RigCalibration",
+    gains: "Mapping[int, Gain]",
+    out: Path,
+    frames: int | None,
+    voxel_m: float,
+    workers: int | None,
+    scheduler: str | None,
+) -> None:
+    from rig_calib.offline.capture import open_capture
+    from rig_calib.offline.workers import open_workers
+    from rig_calib.outputs import MESH_GLB, MESH_PLY, write_mesh
+    from rig_calib.terminal import progress_bar
+    from rig_calib.tsdf.fusing import first_positions, fuse_capture
+
+    capture = open_capture(path)
+    positions = first_positions(capture, frames)
+    with progress_bar(console) as tell, open_workers(workers, scheduler) as hands:
+        volume = fuse_capture(
+            capture, positions, known, gains, voxel_m, hands, lambda share: tell("mesh", share)
+        )
+    made = write_mesh(out, volume, known)
+    rims, length_m = made.holes()
+    console.print(
+        f"{len(made.faces):,} triangles, {made.area_m2():.1f} m², in {out / MESH_PLY} and {MESH_GLB}; "
+        f"{rims} rims, {length_m:.0f} m together, where nothing was measured any more"
+    )
 
 
 def export(
@@ -70,7 +121,8 @@ def export(
         typer.Option(
             "--format",
             metavar="FORMAT",
-            help="kalibr, ros2, urdf, colmap, nerfstudio, opencv; of frames others. See docs/exports.md.",
+            help="kalibr, ros2, urdf, colmap, nerfstudio, opencv; of frames foxglove, rerun, tum, rig-folder "
+            "and others. See docs/exports.md.",
         ),
     ],
     out: Annotated[Path, typer.Option(help="File to write, or a folder, as the format has it.")],
@@ -98,8 +150,16 @@ def export(
     """Write a calibration, or the frames of a capture, for another program (docs/exports.md)."""
     from rich.console import Console
 
+    from rig_calib.exports.formats import FORMATS as CALIBRATION_FORMATS
     from rig_calib.frame_exports.formats import FORMATS
+    from rig_protocol.errors import ConfigurationError
 
+    if form not in (*CALIBRATION_FORMATS, *FORMATS):
+        known = ", ".join((*CALIBRATION_FORMATS, *FORMATS))
+        raise ConfigurationError(f"format {form!r} is none of {known}")
+    if (form in FORMATS) == (source.suffix == ".json"):
+        wanted = "frames: a rig folder, or a recording FILE.mcap" if form in FORMATS else "a calibration.json"
+        raise ConfigurationError(f"{source}: format {form} is of {wanted}")
     console = Console(highlight=False, soft_wrap=True)
     if form in FORMATS:
         _export_frames(

@@ -24,6 +24,8 @@ _EXAMPLES = """
 
 `rig-calib fuse captures/hall --calibration results/calibration.json --out hall` — fuse another capture
 
+`rig-calib fuse take.mcap --calibration results/calibration.json --out hall --mesh` — a surface, too
+
 `rig-calib pose-graph map.g2o --out solved.g2o --robust` — optimise any graph of 3D poses
 
 `rig-calib check results/calibration.json captures/today` — has a camera moved since then?

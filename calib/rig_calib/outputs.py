@@ -1,4 +1,4 @@
-"""The files of one calibration: calibration.json, report.html, cloud.ply, panorama.png."""
+"""The files of one calibration: calibration.json, report.html, cloud.ply, panorama.png, and its meshes."""
 
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
@@ -7,13 +7,19 @@ from rig_calib.evidence import EdgeEvidence
 from rig_calib.fusion.fused import FusedRig, fuse_rig
 from rig_calib.fusion.panorama_picture import write_panorama
 from rig_calib.fusion.ply import write_ply
+from rig_calib.fusion.viewpoint import rig_viewpoint
 from rig_calib.report import write_report
 from rig_calib.rig_calibration import RigCalibration
+from rig_calib.tsdf.extraction import extract_mesh
+from rig_calib.tsdf.mesh import Mesh
+from rig_calib.tsdf.mesh_files import write_mesh_glb, write_mesh_ply
+from rig_calib.tsdf.volume import Volume
 from rig_calib.view import CameraView
 from rig_calib.whole_file import whole_file
 from rig_protocol.errors import ConfigurationError
 from rig_protocol.poses import Pose
 
+MESH_PLY, MESH_GLB = "mesh.ply", "mesh.glb"
 NAME, BEFORE = "calibration.json", "calibration-before.json"
 
 
@@ -83,3 +89,13 @@ def write_fused(folder: Path, calibration: RigCalibration, views: Sequence[Camer
     if fused.panorama is not None:
         write_panorama(folder / "panorama.png", fused.panorama)
     return fused
+
+
+def write_mesh(folder: Path, volume: Volume, calibration: RigCalibration) -> Mesh:
+    """Write mesh.ply and mesh.glb of a volume, small floating pieces left out; needs the extra `mesh`."""
+    mesh = extract_mesh(volume).without_small_pieces()
+    write_mesh_ply(folder / MESH_PLY, mesh)
+    write_mesh_glb(
+        folder / MESH_GLB, mesh, rig_viewpoint(calibration.poses, calibration.rig_frame).T_rig_view
+    )
+    return mesh

@@ -10,7 +10,8 @@ from rig_protocol.recorded_hellos import recorded_hellos
 from rig_protocol.recorded_sets import EncodedSet, synchroniser_of, with_frames, with_sets
 from rig_protocol.recording import HELLOS, Recording
 
-_FRAMES = 5  # where nobody says how many: as many as `rig-server --calibrate` takes
+DEFAULT_FRAMES = 5
+"""Where nobody says how many: as many as `rig-server --calibrate` takes."""
 
 
 def is_recording(capture: Path) -> bool:
@@ -33,7 +34,7 @@ def recorded_panoramas(take: Path, frames: int | None = None) -> Iterator[Panora
     ConfigurationError when there are fewer, DataError for what is no recording or damaged.
     """
     recording = Recording(take)
-    cameras, found, wanted = recording.description.camera_ids, 0, frames or _FRAMES
+    cameras, found, wanted = recording.description.camera_ids, 0, frames or DEFAULT_FRAMES
     for one in encoded_sets(recording):
         held = [frame for camera_id in cameras if (frame := _whole(one, camera_id)) is not None]
         if len(held) == len(cameras):

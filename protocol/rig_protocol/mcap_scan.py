@@ -4,6 +4,7 @@ The `mcap` library's readers trust the lengths inside a record and want a sound 
 bounded before it is read; its content is parsed by the library.
 """
 
+import os
 import struct
 import zlib
 from collections.abc import Iterator
@@ -20,7 +21,11 @@ MAX_RECORD_BYTES = 64 << 20
 MAX_CHUNKS = 1 << 20
 _RECORD = struct.Struct("<BQ")
 _CHUNK_TIMES = struct.Struct("<QQ")
+_CHUNK_HEAD = struct.Struct("<QQQII")  # times, size and check sum of the content, length of its compression
+_CONTENT_LENGTH = struct.Struct("<Q")
 _FOOTER, _SCHEMA, _CHANNEL, _MESSAGE, _CHUNK, _ATTACHMENT, _METADATA, _DATA_END = 2, 3, 4, 5, 6, 9, 12, 15
+_MESSAGE_INDEX = 7
+_MAX_INDEX_BYTES = 1 << 20  # of one topic in one chunk
 _MAX_SMALL_BYTES = 64 << 20  # channels, attachments and metadata of one file
 
 
@@ -38,7 +43,8 @@ class ChunkPlace:
 class Contents:
     """What a file holds, without the messages. `sound`: it was finished in order.
 
-    `topics`: of the channels that the summary lists. The last attachment of a name counts.
+    `topics`: of the channels that are known: those of the summary, or more once the chunks were read. The
+    last attachment of a name counts.
     """
 
     chunks: list[ChunkPlace] = field(default_factory=list)
@@ -101,6 +107,62 @@ def chunk_messages(
             message = _parsed("Message", stream.read(length), path, length)
             if message.channel_id in topics:
                 yield topics[message.channel_id], message.log_time, message.data
+
+
+def topic_messages(
+    file: BinaryIO, place: ChunkPlace, topic: str, topics: dict[int, str], path: Path
+) -> list[bytes]:
+    """The messages of one topic in a chunk, found by its message indexes: the check sum is not looked at.
+
+    Where indexes are absent, do not fit or name an unknown channel, the chunk is read by `chunk_messages`.
+    """
+    try:
+        found, room = [], min(place.length, MAX_RECORD_BYTES)
+        for offset in _indexed_offsets(file, place, topic, topics, path):
+            found.append(_message_at(file, place, offset, topic, topics, path))
+            room -= len(found[-1])
+            if room < 0:  # messages within messages
+                raise DataError(f"{path} has message indexes that do not fit")
+    except DataError:
+        return [data for name, _, data in chunk_messages(file, place, topics, path) if name == topic]
+    return found
+
+
+def _indexed_offsets(
+    file: BinaryIO, place: ChunkPlace, topic: str, topics: dict[int, str], path: Path
+) -> list[int]:
+    """Where in the file the topic's messages begin; DataError where the indexes do not tell."""
+    file.seek(place.offset)
+    head = file.read(_CHUNK_HEAD.size).ljust(_CHUNK_HEAD.size, b"\0")
+    first, packed = place.offset + _CHUNK_HEAD.size + _CONTENT_LENGTH.size, _CHUNK_HEAD.unpack(head)[-1]
+    offsets: set[int] = set()
+    file.seek(place.offset + place.length)
+    for count, (opcode, _, length) in enumerate(_records(file, os.fstat(file.fileno()).st_size)):
+        if opcode != _MESSAGE_INDEX and count:  # it follows the last index: they are all there
+            return sorted(first + offset for offset in offsets)
+        if opcode != _MESSAGE_INDEX:
+            break
+        data = file.read(min(length, _MAX_INDEX_BYTES))
+        name = topics.get(int.from_bytes(data[:2], "little"))
+        if name is None or (name == topic and packed):
+            break
+        if name == topic:
+            offsets |= {offset for _, offset in _parsed("MessageIndex", data, path).records}
+    raise DataError(f"{path} has a chunk that is not indexed")
+
+
+def _message_at(
+    file: BinaryIO, place: ChunkPlace, offset: int, topic: str, topics: dict[int, str], path: Path
+) -> bytes:
+    room = place.offset + place.length - offset - _RECORD.size
+    if room >= 0:
+        file.seek(offset)
+        opcode, length = _RECORD.unpack(file.read(_RECORD.size))
+        if opcode == _MESSAGE and length <= min(room, MAX_RECORD_BYTES):
+            message = _parsed("Message", file.read(length), path, length)
+            if topics.get(message.channel_id) == topic:
+                return bytes(message.data)
+    raise DataError(f"{path} has message indexes that do not fit")
 
 
 def _records(file: BinaryIO, size: int) -> Iterator[tuple[int, int, int]]:

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any, Protocol
 
 from rig_protocol.errors import DataError, RigError
-from rig_protocol.mcap_scan import ChunkPlace, Contents, chunk_messages, open_recording, scan
+from rig_protocol.mcap_scan import ChunkPlace, Contents, chunk_messages, open_recording, scan, topic_messages
 from rig_protocol.recording_format import (
     CLOCK,
     DROPS,
@@ -205,7 +205,7 @@ class Recording:
         """Whether the server's sets were recorded."""
         if any(SETS in part.contents.topics.values() for part in self._parts):
             return True
-        return bool(self.torn) and any(isinstance(entry, RecordedSet) for entry in self.entries())
+        return bool(self.torn) and next(self.sets(), None) is not None
 
     def document(self, name: str) -> Any:
         """An attached JSON document; DataError when it is absent or malformed."""
@@ -224,6 +224,15 @@ class Recording:
         """
         for part in self._parts:
             yield from _entries_of(part.path, part.contents, from_ns)
+
+    def sets(self) -> Iterator[RecordedSet]:
+        """The sets alone, in the order in which they were written: of what is indexed no image is read.
+
+        Thereafter `entries` skips to a time in parts that were not finished, too. DataError where the file is
+        damaged and that shows: check sums are for `entries`.
+        """
+        for part in self._parts:
+            yield from _sets_of(part.path, part.contents)
 
     def _chunks(self) -> list[ChunkPlace]:
         chunks = [chunk for part in self._parts for chunk in part.contents.chunks]
@@ -319,7 +328,7 @@ def _entries_of(
     topics, parser = dict(contents.topics), EntryParser()
     with closing(open_recording(path)) as file:
         for place in contents.chunks:
-            # Where no summary lists the channels, the chunks do, and every one must be read.
+            # As long as the channels are unknown, every chunk must be read: they declare them.
             if contents.topics and place.end_ns < from_ns:
                 continue
             try:
@@ -331,5 +340,21 @@ def _entries_of(
             except DataError as error:
                 if leave_out_damaged:
                     continue
-                raise DataError(f"{path}: {error}") from error
+                raise _damaged(path, place, error) from error
             yield from (entry for entry in entries if entry is not None)
+
+
+def _sets_of(path: Path, contents: Contents) -> Iterator[RecordedSet]:
+    topics, parser = dict(contents.topics), EntryParser()
+    with closing(open_recording(path)) as file:
+        for place in contents.chunks:
+            try:
+                found = [parser.parse(SETS, data) for data in topic_messages(file, place, SETS, topics, path)]
+            except DataError as error:
+                raise _damaged(path, place, error) from error
+            yield from (entry for entry in found if isinstance(entry, RecordedSet))
+    contents.topics |= topics
+
+
+def _damaged(path: Path, place: ChunkPlace, error: DataError) -> DataError:
+    return DataError(f"{path}, at byte {place.offset}: {error}")

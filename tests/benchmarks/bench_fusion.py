@@ -32,7 +32,7 @@ from rig_calib.view import views_from_panoramas
 from rig_protocol.camera import CameraModel
 from rig_protocol.frames import NO_DISPARITY, PanoramicFrame
 from rig_protocol.poses import inverse, transform_points
-from support.benchmark_record import machine, merge_results, write_section
+from support.benchmark_record import machine, merge_results, results_of, write_section
 from support.true_optics import first_hits
 
 FRAMES = 3
@@ -292,7 +292,7 @@ def report(results: Mapping[str, Any]) -> str:
 def main() -> None:
     """Measure, record, print."""
     results = run()
-    merge_results({"fusion": results})
+    merge_results({"fusion": (results_of("fusion") or {}) | results})
     write_section("fusion", report(results))
     print(report(results))
 

@@ -49,6 +49,8 @@ def test_a_camera_that_never_comes_is_named(tmp_path: Path) -> None:
         ("rig_calib.cli", ["solve", ".", "--recalibrate", "cam01", "--out", "out"], "out/calibration.json"),
         ("rig_calib.cli", ["solve", ".", "--calibration", "x.json", "--out", "out"], "--recalibrate"),
         ("rig_calib.cli", ["evaluate", "absent.json", "absent.json"], "absent.json"),
+        ("rig_calib.cli", ["export", "c.json", "--format", "tum", "--out", "o"], "a recording FILE.mcap"),
+        ("rig_calib.cli", ["export", "t.mcap", "--format", "ros2", "--out", "o"], "a calibration.json"),
     ],
 )
 def test_a_wrong_option_ends_with_2_and_says_which(

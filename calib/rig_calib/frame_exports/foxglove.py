@@ -23,6 +23,7 @@ from mcap_protobuf.writer import Writer
 
 from rig_calib.exports.ros2 import COLOR_FRAME, DEPTH_FRAME, ROOT
 from rig_calib.exports.rotations import quaternion_wxyz
+from rig_calib.frame_exports.frame_files import make_folder_of
 from rig_calib.frame_exports.job import Exported, ExportJob
 from rig_calib.frame_exports.placed_cameras import (
     PlacedCamera,
@@ -60,6 +61,7 @@ def export(job: ExportJob) -> Exported:
     itself tells the exposure.
     """
     refuse_existing(job.out)
+    make_folder_of(job.out)
     cameras, stamps = placed_cameras(job), TimeStamps.of(job.capture)
     written = dict.fromkeys((camera.id for camera in cameras), 0)
     with whole_file(job.out) as file, Writer(file) as writer:

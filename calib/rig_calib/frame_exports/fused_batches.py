@@ -6,6 +6,8 @@ from contextlib import contextmanager
 from dataclasses import asdict
 from threading import Lock
 
+import numba
+
 from rig_calib.frame_exports.content_hash import content_hash
 from rig_calib.fusion.live import FusedFrame, LiveFusion, LiveFusionSettings
 from rig_calib.offline.capture import Capture
@@ -57,12 +59,16 @@ def borrowed_fusion(
 
 
 def usual_settings(capture: Capture) -> LiveFusionSettings:
-    """The defaults, with depth images in the camera that the capture's first ones are in."""
+    """The defaults, with depth images in the camera that the capture's first ones are in.
+
+    One thread where this process is one of several workers (dask_workers.py).
+    """
+    threads = min(2, numba.get_num_threads())
     for panorama in capture.read(range(len(capture.marks))):
         for frame in panorama.frames.values():
             if frame is not None and (frame.raw is not None or frame.depth_mm is not None):
-                return LiveFusionSettings(depth_frame=frame.depth_frame)
-    return LiveFusionSettings()
+                return LiveFusionSettings(depth_frame=frame.depth_frame, threads=threads)
+    return LiveFusionSettings(threads=threads)
 
 
 def _taken(key: str) -> LiveFusion | None:

@@ -20,6 +20,9 @@ _MAX_FLICKER = 1.5  # raw steps of standard deviation over frames, three times t
 # The bilateral filter spans the 9×9 correlation window and keeps steps above three raw steps.
 _SMOOTH_WINDOW_PX, _SMOOTH_SIGMA_PX, _SMOOTH_SIGMA_STEPS = 9, 3.0, 1.5
 
+# A gap is bridged where the means of its sides differ by less than this, six deviations of the noise.
+_SAME_STEPS, _BRIDGING_PAIRS = 3.0, 3
+
 
 def mean_disparity(images: Sequence[Array]) -> Array:
     """Mean disparity (H,W) over frames, NaN where most frames have none or where it flickers."""
@@ -34,6 +37,27 @@ def mean_disparity(images: Sequence[Array]) -> Array:
     mean = total / seen
     variance = squares / seen - mean * mean
     return np.where((2 * count >= len(images)) & (count > 0) & (variance < _MAX_FLICKER**2), mean, np.nan)
+
+
+def bridge_gaps(disparity: Array) -> Array:
+    """Disparity (H,W) where single pixels without any take what opposite neighbours have in their midst.
+
+    Of the four pairs at least three must be measured and agree. A plane stays a plane; what is bridged
+    across a step stands out as one.
+    """
+    padded = np.pad(disparity, 1, constant_values=np.nan)
+    height, width = disparity.shape
+    pairs = []
+    for down, across in ((0, 1), (1, 0), (1, 1), (1, -1)):
+        before = padded[1 - down : 1 - down + height, 1 - across : 1 - across + width]
+        after = padded[1 + down : 1 + down + height, 1 + across : 1 + across + width]
+        pairs.append((before + after) / 2)
+    means = np.stack(pairs)
+    known = np.isfinite(means)
+    count, total = known.sum(axis=0), np.where(known, means, 0.0).sum(axis=0)
+    spread = np.where(known, means, -np.inf).max(axis=0) - np.where(known, means, np.inf).min(axis=0)
+    bridged = ~np.isfinite(disparity) & (count >= _BRIDGING_PAIRS) & (spread < _SAME_STEPS)
+    return np.where(bridged, total / np.maximum(count, 1), disparity)
 
 
 def smooth_disparity(disparity: Array) -> Array:

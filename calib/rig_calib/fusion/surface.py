@@ -6,8 +6,15 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from rig_calib.depth_model import DepthCorrection, depth_grid, depth_sigma_m, disparity_image, grid_points
-from rig_calib.fusion.cleaning import cos_incidence, mean_disparity, smooth_disparity, solid_pixels
+from rig_calib.depth_model import (
+    DepthCorrection,
+    DepthGrid,
+    depth_grid,
+    depth_sigma_m,
+    disparity_image,
+    grid_points,
+)
+from rig_calib.fusion.cleaning import Mask, cos_incidence, mean_disparity, smooth_disparity, solid_pixels
 from rig_calib.fusion.sampling import mean_color, sample_colors
 from rig_calib.fusion.visibility import seen_in_color
 from rig_calib.rig_calibration import RigCalibration
@@ -64,6 +71,13 @@ def frames_of(view: CameraView, frame: int | None) -> list[int]:
     return [k for k in range(count) if frame is None or k == frame]
 
 
+def clean_disparity(grid: DepthGrid, measured: Array) -> tuple[Array, Array, Mask]:
+    """A disparity image (H,W) smoothed; cosines of incidence; which pixels hold a surface."""
+    disparity = smooth_disparity(measured)
+    incidence = cos_incidence(grid, disparity)
+    return disparity, incidence, solid_pixels(disparity, incidence)
+
+
 def camera_surface(
     view: CameraView, correction: DepthCorrection | None = None, frame: int | None = None
 ) -> Surface:
@@ -75,9 +89,8 @@ def camera_surface(
     if not frames:
         raise ValueError(f"{view.name} has no colour with depth in frame {frame}")
     grid = depth_grid(view.model, view.depth_frame)
-    disparity = smooth_disparity(mean_disparity([disparity_image(view, k) for k in frames]))
-    incidence = cos_incidence(grid, disparity)
-    solid = solid_pixels(disparity, incidence)
+    measured = mean_disparity([disparity_image(view, k) for k in frames])
+    disparity, incidence, solid = clean_disparity(grid, measured)
     rows, columns = np.nonzero(solid)
     pixels = np.column_stack([columns, rows])
     points, depth_m = grid_points(grid, pixels, disparity[rows, columns], correction)

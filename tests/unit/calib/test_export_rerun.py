@@ -1,5 +1,6 @@
 """Rerun recordings, read by Rerun's own reader: entities, units, directions, timelines."""
 
+import shutil
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -11,6 +12,7 @@ from rerun.chunk import RrdReader
 
 from rig_calib.frame_exports import rerun
 from rig_protocol.camera import Intrinsics
+from rig_protocol.errors import RigError
 from rig_protocol.poses import Pose
 from support.box_takes import (
     CREATED_NS,
@@ -155,6 +157,15 @@ def test_timelines_are_the_frame_rig_time_and_unix_time(columns: Columns) -> Non
         unix_ns = np.datetime64(utc.replace(tzinfo=None), "ns").astype(np.int64)
         assert unix_ns == CREATED_UNIX_NS + k * PERIOD_NS + 2_000_000
     assert not any("log_time" in name or "log_tick" in name for name in columns)
+
+
+def test_a_full_disk_is_told_before_rerun_meets_it(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    take = write_take(tmp_path / "take.mcap", box_description(), [box_panorama(0)], box_calibration())
+    full = shutil._ntuple_diskusage(10**9, 10**9 - 4096, 4096)  # type: ignore[attr-defined]
+    monkeypatch.setattr(shutil, "disk_usage", lambda _: full)
+    with pytest.raises(RigError, match="nearly full"):
+        rerun.export(export_job(take, tmp_path / "take.rrd"))
+    assert [path.name for path in tmp_path.iterdir()] == ["take.mcap"]
 
 
 def test_the_room_stands_upright(columns: Columns) -> None:

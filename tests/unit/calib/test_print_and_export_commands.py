@@ -128,6 +128,7 @@ def test_a_doubtful_calibration_is_exported_with_a_word(
     ("words", "told"),
     [
         (["calibration.json", "--format", "ros1", "--out", "x"], "ros2"),
+        (["calibration.json", "--format", "ros1", "--out", "x"], "foxglove"),
         (["absent.json", "--format", "ros2", "--out", "x"], "absent.json"),
         (["calibration.json", "--format", "colmap", "--out", "x"], "--rig"),
         (["calibration.json", "--format", "colmap", "--out", "x", "--rig", "absent"], "absent"),

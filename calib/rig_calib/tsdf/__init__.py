@@ -1,0 +1,1 @@
+"""Truncated signed distances of what a rig measured, weighted by its noise, and the mesh at their zero."""
