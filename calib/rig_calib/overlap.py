@@ -101,6 +101,15 @@ def shared_regions(
     return regions
 
 
+def seen_grid(of: Intrinsics, by: Intrinsics, T_by_of: Pose) -> npt.NDArray[np.bool_]:
+    """Where, on a coarse grid (rows, columns) all over image `of`, camera `by` sees at any depth."""
+    pixels, rays = _grid(of)
+    pinhole = np.array([by.fx, by.fy, by.cx, by.cy])
+    low = np.array([-0.5, -0.5])
+    seen = _seen(rays, T_by_of, pinhole, low, np.array([by.width, by.height]) - 1.0 - low)
+    return seen.reshape(-1, len(np.unique(pixels[:, 0])))
+
+
 def _seen_region(of: Intrinsics, by: Intrinsics, T_by_of: Pose, margin_deg: float) -> Region | None:
     """The part of image `of` that camera `by` sees at any depth of the sensor's range."""
     pixels, rays = _grid(of)

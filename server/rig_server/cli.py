@@ -1,11 +1,8 @@
 """The command line of `rig-server`."""
 
-import contextlib
 import json
-from collections.abc import Iterator
-from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 from rich.console import Console
@@ -13,10 +10,42 @@ from rich.console import Console
 from rig_protocol.errors import ConfigurationError
 from rig_protocol.programs import EXIT_FAILED, run_program, set_up_logging
 from rig_server.operator_cli import add_operator_commands
+from rig_server.option_rules import (
+    parsed_speed,
+    refuse_with_replay,
+    refuse_without_calibrate,
+    refuse_without_simulate,
+    run_settings,
+)
+from rig_server.options import (
+    CalibrateOption,
+    CalibrationOption,
+    CoachOption,
+    ConfigOption,
+    ConsoleOption,
+    FramesOption,
+    InsecureOption,
+    ListenOption,
+    LoopOption,
+    MethodOption,
+    MetricsOption,
+    OutOption,
+    ProjectorGroupsOption,
+    RecalibrateOption,
+    RecordOption,
+    ReplayOption,
+    ReplaySpeedOption,
+    SeedOption,
+    SeekOption,
+    SimulateOption,
+    TargetDegOption,
+    TargetMmOption,
+    WatchOption,
+)
 
 if TYPE_CHECKING:
     from rig_server.config import RigSettings
-    from rig_server.rig import Rig
+    from rig_server.opening import Origin
 
 _RING = 12  # cameras where no settings say how many
 
@@ -34,6 +63,8 @@ _EXAMPLES = """
 `rig-server --replay take.mcap --calibrate` — calibrate on what was recorded
 
 `rig-server --metrics 9100` — the same, and metrics for a Prometheus on this machine
+
+`rig-server --console 8080` — the same, and the console for a browser on this machine
 
 `rig-server --calibrate --out calibration` — calibrate the ring that streams to this PC
 
@@ -64,88 +95,29 @@ app = typer.Typer(
 @app.callback(invoke_without_command=True, epilog=_EXAMPLES)
 def run(
     context: typer.Context,
-    config: Annotated[
-        Path | None,
-        typer.Option(
-            metavar="FILE", help="Settings; else ./rig.toml, else /etc/kinect-rig/rig.toml, if there."
-        ),
-    ] = None,
-    listen: Annotated[
-        str | None, typer.Option(metavar="HOST:PORT", help="Receive here; else 0.0.0.0:4012.")
-    ] = None,
-    metrics: Annotated[
-        str | None,
-        typer.Option(metavar="[HOST:]PORT", help="Serve metrics to Prometheus; to this machine unless HOST."),
-    ] = None,
-    calibrate: Annotated[
-        bool, typer.Option("--calibrate", help="Calibrate the ring on the first complete sets, then end.")
-    ] = False,
-    simulate: Annotated[
-        int | None,
-        typer.Option(metavar="N", min=1, max=64, help="Start N simulated agents on this machine."),
-    ] = None,
-    seed: Annotated[
-        int | None, typer.Option(metavar="S", min=0, help="Seed of the simulated room and units.")
-    ] = None,
-    frames: Annotated[
-        int | None,
-        typer.Option(metavar="K", min=1, max=100, help="Panoramic frames to use; else 5."),
-    ] = None,
-    method: Annotated[
-        str | None, typer.Option(metavar="joint|paper", help="How to calibrate; else joint.")
-    ] = None,
-    target_mm: Annotated[
-        float | None,
-        typer.Option(metavar="X", help="End once neighbours are expected to be known to X mm (RMS)."),
-    ] = None,
-    target_deg: Annotated[
-        float | None, typer.Option(metavar="X", help="The same for their rotation, in degrees.")
-    ] = None,
-    coach: Annotated[
-        bool,
-        typer.Option(
-            "--coach", help="Go on with fresh sets until every overlap holds: hang patterns meanwhile."
-        ),
-    ] = False,
-    projector_groups: Annotated[
-        int | None,
-        typer.Option(
-            metavar="N", min=1, max=3, help="Capture in 2 or 3 turns, no neighbour's projector on; else 1."
-        ),
-    ] = None,
-    recalibrate: Annotated[
-        str | None,
-        typer.Option(metavar="CAMERA", help="Find only this one (name or id) anew, keep all others."),
-    ] = None,
-    calibration: Annotated[
-        Path | None,
-        typer.Option(metavar="FILE", help="What --recalibrate starts from; else DIR/calibration.json."),
-    ] = None,
-    out: Annotated[
-        Path | None, typer.Option(metavar="DIR", help="Folder for the results; else ./calibration.")
-    ] = None,
-    record: Annotated[
-        Path | None,
-        typer.Option(metavar="FILE.mcap", help="Record what comes, as it comes (docs/recording.md)."),
-    ] = None,
-    replay: Annotated[
-        Path | None, typer.Option(metavar="FILE.mcap", help="Take the frames of a recording, not of agents.")
-    ] = None,
-    replay_speed: Annotated[
-        str | None,
-        typer.Option(metavar="live|max|X", help="As fast as recorded, as possible, X times as fast."),
-    ] = None,
-    loop: Annotated[bool, typer.Option("--loop", help="Begin the recording again at its end.")] = False,
-    seek: Annotated[
-        float | None, typer.Option(metavar="S", min=0, help="Leave out the recording's first S seconds.")
-    ] = None,
-    watch: Annotated[
-        Path | None,
-        typer.Option(metavar="CALIBRATION", help="Say when a camera moves from its place in this file."),
-    ] = None,
-    insecure: Annotated[
-        bool, typer.Option("--insecure", help="Take frames of anybody: only on an isolated bench.")
-    ] = False,
+    config: ConfigOption = None,
+    listen: ListenOption = None,
+    metrics: MetricsOption = None,
+    console: ConsoleOption = None,
+    calibrate: CalibrateOption = False,
+    simulate: SimulateOption = None,
+    seed: SeedOption = None,
+    frames: FramesOption = None,
+    method: MethodOption = None,
+    target_mm: TargetMmOption = None,
+    target_deg: TargetDegOption = None,
+    coach: CoachOption = False,
+    projector_groups: ProjectorGroupsOption = None,
+    recalibrate: RecalibrateOption = None,
+    calibration: CalibrationOption = None,
+    out: OutOption = None,
+    record: RecordOption = None,
+    replay: ReplayOption = None,
+    replay_speed: ReplaySpeedOption = None,
+    loop: LoopOption = False,
+    seek: SeekOption = None,
+    watch: WatchOption = None,
+    insecure: InsecureOption = False,
 ) -> None:
     """Receive the agents' frames and group them into panoramic frames.
 
@@ -156,77 +128,50 @@ def run(
     """
     if context.invoked_subcommand is not None:
         return
-    _refuse_options_without_effect(
-        calibrate,
-        simulate,
-        {
-            "--frames": frames,
-            "--method": method,
-            "--target-mm": target_mm,
-            "--target-deg": target_deg,
-            "--coach": coach or None,
-            "--projector-groups": projector_groups,
-            "--recalibrate": recalibrate,
-            "--calibration": calibration,
-            "--out": out,
-        },
-        seed,
-        listen,
-    )
-    _refuse_with_replay(
-        replay,
-        {"--simulate": simulate, "--listen": listen, "--record": record, "--insecure": insecure or None},
-        {"--replay-speed": replay_speed, "--loop": loop or None, "--seek": seek},
-    )
-    from rig_server.config import WatchSettings, load_rig_settings
-
+    of_calibrate = {
+        "--frames": frames,
+        "--method": method,
+        "--target-mm": target_mm,
+        "--target-deg": target_deg,
+        "--coach": coach or None,
+        "--projector-groups": projector_groups,
+        "--recalibrate": recalibrate,
+        "--calibration": calibration,
+        "--out": out,
+    }
+    of_live = {"--simulate": simulate, "--listen": listen, "--record": record, "--insecure": insecure or None}
+    of_replay = {"--replay-speed": replay_speed, "--loop": loop or None, "--seek": seek}
+    refuse_without_calibrate(calibrate, of_calibrate)
+    refuse_without_simulate(simulate, seed, listen)
+    refuse_with_replay(replay, of_live, of_replay)
     if watch is not None and calibrate:
         raise ConfigurationError("--watch has no effect with --calibrate, which measures all places anew")
+    capture = {
+        "frames": frames,
+        "target_mm": target_mm,
+        "target_deg": target_deg,
+        "projector_groups": projector_groups,
+    }
     changes = {
         "listen": listen,
         "insecure": insecure or None,
         "metrics": metrics,
-        "capture": {
-            "frames": frames,
-            "target_mm": target_mm,
-            "target_deg": target_deg,
-            "projector_groups": projector_groups,
-        },
+        "console": {"listen": console},
+        "capture": capture,
         "calibration": {"method": method},
         "watch": {"calibration": watch},
     }
-    settings = load_rig_settings(config, changes)
-    if calibrate and settings.synchroniser.policy == "latest":
-        raise ConfigurationError(
-            'synchroniser.policy = "latest" repeats frames, which a calibration must not: use "partial"'
-        )
-    if calibrate and replay is not None and settings.capture.projector_groups > 1:
-        raise ConfigurationError("projector groups need a live rig: a recording's projectors cannot be told")
-    if calibrate:  # what is measured anew is not watched over
-        settings = settings.model_copy(update={"watch": WatchSettings()})
-    origin = _Origin(simulate, seed, record, replay, _speed(replay_speed), loop, seek or 0.0)
-    console = Console()
-    set_up_logging(settings.log_level, console)
+    settings = run_settings(config, changes, calibrate, replay is not None)
+    terminal = Console()
+    set_up_logging(settings.log_level, terminal)
     # What takes a second to import comes after everything that can be refused at once.
-    if not calibrate:
-        from rig_server.receiving import receive
+    from rig_server.opening import Origin
 
-        with _open_rig(settings, origin) as rig:
-            receive(rig, console)
-        return
-    from rig_calib.outputs import known_calibration, make_output_folder
-    from rig_server.calibrating import calibrate_rig
-    from rig_server.calibration_task import CalibrationTask
-
-    folder = out or Path("calibration")
-    known = known_calibration(recalibrate, calibration, folder)
-    make_output_folder(folder)
-    with _open_rig(settings, origin) as rig:
-        if recalibrate is None or known is None:
-            task = CalibrationTask.whole_rig(rig.settings, coach)
-        else:
-            task = CalibrationTask.one_camera(rig.settings, known, recalibrate, coach)
-        calibrate_rig(rig, folder, console, task)
+    origin = Origin(simulate, seed, record, replay, parsed_speed(replay_speed), loop, seek or 0.0)
+    if calibrate:
+        _calibrate(settings, origin, terminal, out or Path("calibration"), recalibrate, calibration, coach)
+    else:
+        _receive(settings, origin, terminal)
 
 
 @app.command()
@@ -299,12 +244,7 @@ Exit status: 0 something fits, 1 nothing does, 2 wrong usage or settings.
 
 @app.command(epilog=_BUDGET_EXAMPLES)
 def budget(
-    config: Annotated[
-        Path | None,
-        typer.Option(
-            metavar="FILE", help="Settings; else ./rig.toml, else /etc/kinect-rig/rig.toml, if there."
-        ),
-    ] = None,
+    config: ConfigOption = None,
     cameras: Annotated[
         int | None, typer.Option(metavar="N", min=1, max=64, help="Cameras; else those of rig.toml, else 12.")
     ] = None,
@@ -334,79 +274,38 @@ def budget(
         raise typer.Exit(EXIT_FAILED)
 
 
-@dataclass(frozen=True, slots=True)
-class _Origin:
-    """Where the frames come from, as the options say; `speed` None: as fast as possible."""
+def _receive(settings: "RigSettings", origin: "Origin", terminal: Console) -> None:
+    from rig_server.opening import open_rig
+    from rig_server.receiving import receive
 
-    simulate: int | None
-    seed: int | None
-    record: Path | None
-    replay: Path | None
-    speed: float | None
-    loop: bool
-    seek_s: float
+    with open_rig(settings, origin, terminal) as rig:
+        receive(rig, terminal)
 
 
-@contextlib.contextmanager
-def _open_rig(settings: "RigSettings", origin: _Origin) -> Iterator["Rig"]:
-    """The rig that the options ask for, not begun yet, and its metrics where settings ask for them."""
-    from rig_server.announcement import announced
-    from rig_server.metrics_endpoint import metrics_served
-    from rig_server.operator_requests import OperatorRequests
-    from rig_server.operator_socket import operator_served
-    from rig_server.rig import Rig
-
-    if origin.replay is not None:
-        from rig_server.replay import ReplayOptions
-
-        options = ReplayOptions(origin.speed, origin.loop, origin.seek_s)
-        rig = Rig.replayed(origin.replay, settings, options)
-    elif origin.simulate is not None:
-        rig = Rig.simulated(origin.simulate, origin.seed or 0, settings=settings, record=origin.record)
-    else:
-        rig = Rig.live(settings, origin.record)
-    announces = settings.announce and origin.simulate is None and origin.replay is None
-    with (
-        contextlib.closing(rig),
-        metrics_served(settings.metrics_address, rig.status),
-        operator_served(settings.control_socket, OperatorRequests(rig)),
-        announced(settings.address) if announces else contextlib.nullcontext(),
-    ):
-        yield rig
-
-
-def _refuse_options_without_effect(
-    calibrate: bool, simulate: int | None, of_calibrate: dict[str, Any], seed: int | None, listen: str | None
+def _calibrate(
+    settings: "RigSettings",
+    origin: "Origin",
+    terminal: Console,
+    folder: Path,
+    recalibrate: str | None,
+    calibration: Path | None,
+    coach: bool,
 ) -> None:
-    """ConfigurationError for an option that would have no effect."""
-    for option, value in of_calibrate.items():
-        if value is not None and not calibrate:
-            raise ConfigurationError(f"{option} needs --calibrate")
-    if seed is not None and simulate is None:
-        raise ConfigurationError("--seed needs --simulate N")
-    if listen is not None and simulate is not None:
-        raise ConfigurationError("--listen has no effect with --simulate, which uses a free loopback port")
+    from rig_calib.outputs import known_calibration, make_output_folder
+    from rig_server.calibrating import calibrate_rig
+    from rig_server.calibration_task import CalibrationTask
+    from rig_server.capture_log import CaptureLog
+    from rig_server.opening import open_rig
 
-
-def _refuse_with_replay(replay: Path | None, live: dict[str, Any], of_replay: dict[str, Any]) -> None:
-    """ConfigurationError for an option that a recording, or the lack of one, makes pointless."""
-    for option, value in (of_replay if replay is None else live).items():
-        if value is not None:
-            told = "needs --replay FILE" if replay is None else "has no effect with --replay"
-            raise ConfigurationError(f"{option} {told}")
-
-
-def _speed(text: str | None) -> float | None:
-    """Times the speed of the recording; None for as fast as possible."""
-    if text == "max":
-        return None
-    try:
-        speed = 1.0 if text in (None, "live") else float(text or "")
-    except ValueError:
-        speed = 0.0
-    if not 0.01 <= speed <= 1000:
-        raise ConfigurationError(f"--replay-speed {text}: write live, max, or a number from 0.01 to 1000")
-    return speed
+    known = known_calibration(recalibrate, calibration, folder)
+    make_output_folder(folder)
+    log = CaptureLog(settings.capture.frames)
+    with open_rig(settings, origin, terminal, log) as rig:
+        if recalibrate is None or known is None:
+            task = CalibrationTask.whole_rig(rig.settings, coach)
+        else:
+            task = CalibrationTask.one_camera(rig.settings, known, recalibrate, coach)
+        calibrate_rig(rig, folder, terminal, task, log)
 
 
 add_operator_commands(app)

@@ -132,6 +132,40 @@ class RecordingSettings(TakeSettings):
     """Where takes go that are begun while the server runs; relative to where it was started."""
 
 
+class ConsoleSettings(Settings):
+    """The console: the rig in a web browser (docs/console.md)."""
+
+    listen: str | None = Field(None, examples=["8080"])
+    """Where browsers find it, [HOST:]PORT; a port alone is for this machine only. Unset: there is none."""
+    token_file: Path | None = Field(None, examples=[Path("/etc/kinect-rig/console.token")])
+    """The token that a browser must bring, in a file of mode 0600; unset: a new one at every start."""
+    tile_hz: float = Field(10.0, gt=0, le=30)
+    """How often a second the cameras' pictures are sent to pages that look."""
+    fused_hz: float = Field(4.0, gt=0, le=30)
+    """How often a second sets are fused for cloud and panorama, while a page looks: some 100 ms of a core."""
+    cloud_points: int = Field(80_000, ge=100, le=2_000_000)
+    """Points of the cloud that pages are sent, thinned evenly; a point takes 9 bytes."""
+    folder: Path = Path("calibration")
+    """Where an accepted calibration is written, and where a live rig's console finds that of last time."""
+
+    @field_validator("listen", mode="before")
+    @classmethod
+    def _listen_may_be_a_number(cls, value: object) -> object:
+        return str(value) if isinstance(value, int) else value
+
+    @field_validator("listen")
+    @classmethod
+    def _listen_is_an_address(cls, text: str | None) -> str | None:
+        if text is not None:
+            parse_service_address(text)
+        return text
+
+    @property
+    def address(self) -> Address | None:
+        """`listen` as (host, port); None when there is no console."""
+        return None if self.listen is None else parse_service_address(self.listen)
+
+
 class RigSettings(Settings):
     """Settings of rig-server. Write your own values over the defaults below."""
 
@@ -164,6 +198,7 @@ class RigSettings(Settings):
     calibration: CalibrationSettings = CalibrationSettings()
     watch: WatchSettings = WatchSettings()
     recording: RecordingSettings = RecordingSettings()
+    console: ConsoleSettings = ConsoleSettings()
     ring: RingSettings | None = None
     """The drawing of the ring; leave it out when the cameras' places are unknown."""
     cameras: tuple[CameraSettings, ...] = ()
@@ -184,7 +219,7 @@ class RigSettings(Settings):
     @classmethod
     def _metrics_is_an_address(cls, text: str | None) -> str | None:
         if text is not None:
-            parse_metrics_address(text)
+            parse_service_address(text)
         return text
 
     @model_validator(mode="after")
@@ -206,7 +241,7 @@ class RigSettings(Settings):
     @property
     def metrics_address(self) -> Address | None:
         """`metrics` as (host, port); None when nobody may ask."""
-        return None if self.metrics is None else parse_metrics_address(self.metrics)
+        return None if self.metrics is None else parse_service_address(self.metrics)
 
 
 def load_rig_settings(file: Path | None, overrides: Mapping[str, Any] | None = None) -> RigSettings:
@@ -237,7 +272,7 @@ def parse_address(text: str) -> Address:
     return host or "0.0.0.0", int(port_text)  # noqa: S104  # an empty host means all interfaces, as in `:4012`
 
 
-def parse_metrics_address(text: str) -> Address:
+def parse_service_address(text: str) -> Address:
     """[HOST:]PORT; without a host only this machine may ask. ValueError says what is wrong with it."""
     host, _, port = text.rpartition(":")
     if not port.isdecimal() or text.startswith(":"):

@@ -15,10 +15,10 @@ from typing import Any, Self
 from prometheus_client import CollectorRegistry, ProcessCollector, generate_latest
 from prometheus_client.exposition import CONTENT_TYPE_PLAIN_0_0_4
 
-from rig_protocol.errors import ConfigurationError
 from rig_protocol.events import Address
 from rig_server.exposition import RigCollector
 from rig_server.metrics import RigStatus
+from rig_server.tcp_socket import in_use_sentence, resolve
 from rig_server.udp_socket import bind_error
 
 logger = logging.getLogger(__name__)
@@ -205,18 +205,9 @@ def _hang_up(connection: socket.socket) -> None:
 
 
 def _bound_server(address: Address, page: _Page) -> _Server:
-    host, port = address
-    try:
-        family, _, _, _, where = socket.getaddrinfo(
-            host, port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE
-        )[0]
-    except socket.gaierror as error:
-        raise ConfigurationError(f"metrics address {host!r} is not known: {error.strerror}") from error
+    family, where = resolve(address, "metrics")
     try:
         return _Server(family, where, page)
     except OSError as error:
-        in_use = (
-            f"TCP port {port} is in use: see what listens there (`ss -tlnp sport = :{port}`; Prometheus' "
-            f"node exporter takes 9100, too) or choose another with --metrics"
-        )
-        raise bind_error(error, address, in_use) from error
+        otherwise = "choose another with --metrics (Prometheus' node exporter takes 9100, too)"
+        raise bind_error(error, address, in_use_sentence(address, otherwise)) from error

@@ -12,13 +12,8 @@ from rich.table import Table
 
 from rig_protocol.errors import ConfigurationError
 from rig_protocol.programs import EXIT_FAILED
+from rig_server.options import ConfigOption
 
-ConfigOption = Annotated[
-    Path | None,
-    typer.Option(
-        "--config", metavar="FILE", help="Settings; else ./rig.toml, else /etc/kinect-rig/rig.toml, if there."
-    ),
-]
 SocketOption = Annotated[
     Path | None,
     typer.Option("--socket", metavar="FILE", help="The server's `control_socket`; else of the settings."),

@@ -121,6 +121,7 @@ class Rig:
         self._swapping = threading.Lock()  # one thread at a time begins, swaps or ends the drift watch
         self._running = False
         self._watch: WatchSink | None = None
+        self._offers: list[Callable[[PanoramicFrame], None]] = []
         if settings.watch.calibration is not None:
             self.put_in_force(_watched_calibration(settings.watch.calibration), watch=True)
 
@@ -235,7 +236,14 @@ class Rig:
         watch = self._watch  # others swap it
         if panorama is not None and watch is not None:
             watch.offer(panorama, lambda: self.description)
+        if panorama is not None:
+            for offer in self._offers:
+                offer(panorama)
         return panorama
+
+    def on_set(self, offer: Callable[[PanoramicFrame], None]) -> None:
+        """Hand every set that is taken from now on to `offer`, too, which must not wait."""
+        self._offers.append(offer)
 
     def wait_for_cameras(
         self, timeout_s: float = 60.0, on_wait: Callable[[RigStatus], None] | None = None

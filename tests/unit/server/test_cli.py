@@ -209,3 +209,22 @@ def test_a_torn_take_is_recovered_and_played_by_the_program(
     assert "take.mcap is sound" in capsys.readouterr().out
     assert rig_server("--replay", "take.mcap", "--replay-speed", "max") == 0
     assert "recording take.mcap has ended: 5 complete, 0 partial sets" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize("address", ["nonsense", ":8080", "localhost:port", "127.0.0.1:99999"])
+def test_a_consoles_address_that_makes_no_sense_is_refused_at_once(
+    rig_server: Program, capsys: pytest.CaptureFixture[str], address: str
+) -> None:
+    assert rig_server("--insecure", "--console", address) == 2
+    told = capsys.readouterr().err
+    assert "console" in told
+    assert address in told
+
+
+def test_a_console_whose_port_is_taken_says_what_to_do(
+    rig_server: Program, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        port = str(taken.getsockname()[1])
+        assert rig_server("--insecure", "--listen", "127.0.0.1:0", "--console", port) == 1
+    assert f"TCP port {port} is in use" in capsys.readouterr().err

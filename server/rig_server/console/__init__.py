@@ -1,0 +1,1 @@
+"""The console: the rig in a web browser."""

@@ -1,0 +1,106 @@
+"""From a frame's last datagram to its tile painted in a real browser, the page's word back included.
+
+python tests/benchmarks/console_latency.py [--seconds 20] [--cameras 12] [--fps 30]
+
+Prints JSON: percentiles in ms, and `skipped` with the reason where there is no Chromium. Cameras, server and
+browser share this machine. There is no calibration, and so no cloud: without a GPU it is drawn in software,
+which would be measured. Median and 95th percentile are in the page's footer, too. The bar is 200 ms.
+"""
+
+import argparse
+import json
+import sys
+import threading
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
+
+from rig_server import Rig
+from rig_server.config import CameraSettings, ConsoleSettings, RigSettings
+from rig_server.console.console import RigConsole
+from support.browser import browser, chromium_path
+from support.key_for_tests import rig_key_file
+from support.preencoded_sender import Play, encoded_file, sender_process
+
+WARM_UP_S = 5.0
+SHARES = {"p50_ms": 0.5, "p95_ms": 0.95, "p99_ms": 0.99}
+
+
+def console_latency(seconds: float = 15.0, cameras: int = 12, fps: float = 30.0) -> dict[str, Any]:
+    """Percentiles over all tiles of so many seconds; `console_latency_ms` is the 95th."""
+    chromium = chromium_path()
+    if chromium is None:
+        return {"skipped": "there is no Chromium on this machine: apt install chromium"}
+    settings = RigSettings(
+        listen="127.0.0.1:0",
+        key_file=rig_key_file(),
+        cameras=tuple(CameraSettings(id=i) for i in range(cameras)),
+        console=ConsoleSettings(listen="127.0.0.1:0"),
+    )
+    rig = Rig.live(settings)
+    play = Play(rig.place.removeprefix("UDP "), range(cameras), fps, seconds + 60.0)
+    with (
+        RigConsole(rig) as console,
+        _taken(rig),
+        encoded_file() as (file, _),
+        sender_process(play, file),
+        browser(chromium, webgl=False) as opened,
+    ):
+        page = opened.new_page(viewport={"width": 1440, "height": 900})
+        page.goto(console.link)
+        page.wait_for_selector(".tile:not(.gone)", timeout=60_000)
+        page.wait_for_timeout(1000 * WARM_UP_S)
+        before, begin_s = console.latency(), time.monotonic()
+        page.wait_for_timeout(1000 * seconds)
+        seen, status = console.latency().since(before), rig.status()
+        lasted_s = time.monotonic() - begin_s
+    told = {name: _ms(seen.quantile_ns(share)) for name, share in SHARES.items()}
+    return {
+        "console_latency_ms": told["p95_ms"],
+        **told,
+        "tiles_per_s": round(seen.count / lasted_s, 1),
+        "sets_per_s": round(status.sets_per_s, 1),
+        "cameras": cameras,
+        "fps": fps,
+    }
+
+
+@contextmanager
+def _taken(rig: Rig) -> Iterator[None]:
+    """The rig runs, and a thread takes its sets, as `rig-server` does."""
+    over = threading.Event()
+
+    def take() -> None:
+        while not over.is_set():
+            rig.next_panorama(0.25)
+
+    with rig:
+        thread = threading.Thread(target=take, name="taking", daemon=True)
+        thread.start()
+        try:
+            yield
+        finally:
+            over.set()
+            thread.join()
+
+
+def _ms(duration_ns: float | None) -> float | None:
+    return None if duration_ns is None else round(duration_ns / 1e6, 1)
+
+
+def main() -> None:
+    """Measure and print."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
+    parser.add_argument("--seconds", type=float, default=15.0)
+    parser.add_argument("--cameras", type=int, default=12)
+    parser.add_argument("--fps", type=float, default=30.0)
+    known = parser.parse_args()
+    print(json.dumps(console_latency(known.seconds, known.cameras, known.fps), indent=2))
+
+
+if __name__ == "__main__":
+    main()
