@@ -54,6 +54,7 @@ bench-calibration: $(BENCH)  ## the calibration against its bars, the bound and 
 bench-fusion: $(READY) build/open3d  ## live fusion and meshes against their bars and Open3D, into docs/
 	$(BIN)/python tests/benchmarks/bench_fusion.py
 	$(BIN)/python tests/benchmarks/bench_recording.py
+	$(BIN)/python tests/benchmarks/console_latency.py
 	$(BIN)/python tests/benchmarks/surface_error.py
 	$(BIN)/python tests/benchmarks/offline_scaling.py
 

@@ -62,6 +62,8 @@ _EXAMPLES = """
 
 `rig-server --replay take.mcap --calibrate` — calibrate on what was recorded
 
+`rig-server --replay take.mcap --seek 60 --record part.mcap` — cut a part out of it
+
 `rig-server --metrics 9100` — the same, and metrics for a Prometheus on this machine
 
 `rig-server --console 8080` — the same, and the console for a browser on this machine
@@ -139,7 +141,7 @@ def run(
         "--calibration": calibration,
         "--out": out,
     }
-    of_live = {"--simulate": simulate, "--listen": listen, "--record": record, "--insecure": insecure or None}
+    of_live = {"--simulate": simulate, "--listen": listen, "--insecure": insecure or None}
     of_replay = {"--replay-speed": replay_speed, "--loop": loop or None, "--seek": seek}
     refuse_without_calibrate(calibrate, of_calibrate)
     refuse_without_simulate(simulate, seed, listen)

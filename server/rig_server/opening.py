@@ -40,7 +40,8 @@ class Origin:
     def rig(self, settings: RigSettings) -> Rig:
         """The rig, not begun yet."""
         if self.replay is not None:
-            return Rig.replayed(self.replay, settings, ReplayOptions(self.speed, self.loop, self.seek_s))
+            options = ReplayOptions(self.speed, self.loop, self.seek_s)
+            return Rig.replayed(self.replay, settings, options, self.record)
         if self.simulate is not None:
             return Rig.simulated(self.simulate, self.seed or 0, settings=settings, record=self.record)
         return Rig.live(settings, self.record)
