@@ -98,11 +98,12 @@ class Ring(NamedTuple):
 class Drum(NamedTuple):
     """The cylinder as the kernels need it; `starts` (C,) and `cells` (C,W',H) are every camera's window.
 
+    `T_window_rig` (C,3,4): z along the cylinder's axis, x towards the middle of the window.
+
     A window is kept column by column, as the cameras of a ring, which stand upright, draw it row by row.
     """
 
-    T_view_rig: Array32  # (3,4)
-    azimuth_left: F32
+    T_window_rig: Array32  # (C,3,4)
     pixels_per_rad: F32
     slope_top: F32
     circle: int  # columns of a full circle

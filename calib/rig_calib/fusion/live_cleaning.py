@@ -84,7 +84,9 @@ def _on_surface(scratch: Scratch, y: int, lens: Lens, height: int) -> None:
     above, row, below = scratch.inverse[y - 1], scratch.inverse[y], scratch.inverse[y + 1]
     solid, likely = scratch.solid[y], scratch.likely[y]
     width = row.size
-    half = F32(min(width, height)) * HALF
+    # Factors: a loop over pixels has no time for divisions.
+    of_half, of_fx = ONE / (F32(min(width, height)) * HALF), ONE / lens.fx
+    slope_x, slope_y = lens.fx / _SIX, lens.fy / _SIX
     down_edge = F32(min(y, height - 1 - y)) + HALF
     ray_y = (F32(y) - lens.cy) / lens.fy
     solid[0], solid[width - 1] = 0, 0
@@ -96,13 +98,13 @@ def _on_surface(scratch: Scratch, y: int, lens: Lens, height: int) -> None:
         west, middle, east = left_up + left + left_down, up + c + down, right_up + right + right_down
         north, waist, south = left_up + up + right_up, left + c + right, left_down + down + right_down
         across, along = abs(west + east - TWO * middle), abs(north + south - TWO * waist)
-        nx, ny = (east - west) * lens.fx / _SIX, (south - north) * lens.fy / _SIX
-        ray_x = (F32(x) - lens.cx) / lens.fx
+        nx, ny = (east - west) * slope_x, (south - north) * slope_y
+        ray_x = (F32(x) - lens.cx) * of_fx
         nz = c - nx * ray_x - ny * ray_y
         cos2 = c * c / ((nx * nx + ny * ny + nz * nz) * (ONE + ray_x * ray_x + ray_y * ray_y))
         good = (c < _MEASURED) & (across < _EDGE_SUM) & (along < _EDGE_SUM) & (cos2 > _COS2_STEEPEST)
         solid[x] = np.uint8(good)
-        border = min(min(F32(x), F32(width - 1 - x)) + HALF, down_edge) / half
+        border = min(min(F32(x), F32(width - 1 - x)) + HALF, down_edge) * of_half
         scaled = c * F32(0.01)
         likely[x] = cos2 * (scaled * scaled) * (scaled * scaled) * border * border
 

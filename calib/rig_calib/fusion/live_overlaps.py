@@ -138,15 +138,15 @@ def _add_partner(
     for x in range(begin, end):
         found = np.uint32(places[_FOUND + x])
         depth, own = rows[_DEPTH + x], rows[WEIGHT + x]
-        away = ONE / inverse_of(found) - depth
-        same = (abs(away) < _SAME_SURFACE_M + _SAME_SURFACE_RATIO * depth) & (
+        stretch = ONE / (inverse_of(found) * depth) - ONE  # from the point to the surface, as part of the ray
+        same = (abs(stretch * depth) < _SAME_SURFACE_M + _SAME_SURFACE_RATIO * depth) & (
             places[_PIXEL + x] >= np.int32(0)
         )
         weight = weight_of(found) if same else ZERO
         yields = (weight > own) | ((weight == own) & (wins > np.int32(0)))
         rows[OWNED + x] = ZERO if yields else rows[OWNED + x]
         rows[_TOTAL + x] += weight
-        share = weight * away / depth  # by how much of the ray, times the weight
+        share = weight * stretch
         rows[_DX + x] += share * (rows[X + x] - x0)
         rows[_DY + x] += share * (rows[Y + x] - y0)
         rows[_DZ + x] += share * (rows[Z + x] - z0)

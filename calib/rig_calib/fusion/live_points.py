@@ -16,6 +16,7 @@ from rig_calib.fusion.live_arrays import (
     MARGIN,
     ONE,
     PITCH,
+    TWO,
     U8,
     U32,
     UNITS_A_METRE,
@@ -32,7 +33,7 @@ from rig_calib.fusion.live_overlaps import OWNED, WEIGHT, U, V, X, Y, Z, merge_r
 from rig_protocol.compiled import compiled, inlined
 
 _SHARE = F32(1.8)  # makes the weight of a camera that looks straight at a surface fill a byte
-_PI, _HALF_PI, _TURN = F32(np.pi), F32(np.pi / 2), F32(2 * np.pi)
+_PI = F32(np.pi)
 _HIDDEN = F32(-1e9)  # a colour column that passes none
 _FULL = F32(255.0)
 _FORWARD, _BACKWARD = np.uint64(1), np.uint64(2**64 - 1)  # steps along a row, modulo 2^64
@@ -125,8 +126,8 @@ def place_points(
     for y in range(height):
         _place_row(camera, y, measured[camera, y], ring, rows)
         merge_row(camera, y, measured, ring, rows, places)
-        _project_row(width, drum, rows)
-        _draw_row(camera, width, drum, rows, places)
+        _project_row(camera, width, drum, rows)
+        _draw_row(width, drum, rows, places)
         _color_row(width, size, kind, rows, places)
         if scan > 0:
             _hide_row(width, _FORWARD, ONE, rows, places)
@@ -186,57 +187,55 @@ def _table_row(planes: Array32, tables: I16, k: int, y: int) -> tuple[F32, F32, 
 
 
 @inlined
-def _project_row(width: np.uint64, drum: Drum, rows: Array32) -> None:
-    """Each point's distance from the cylinder's axis, and its column and row there, to be cut to integers."""
-    T = drum.T_view_rig
+def _project_row(camera: int, width: np.uint64, drum: Drum, rows: Array32) -> None:
+    """Each point's distance from the cylinder's axis, and its column and row of the window, to be cut."""
+    T = drum.T_window_rig[camera]
     t00, t01, t02, t03 = T[0, 0], T[0, 1], T[0, 2], T[0, 3]
     t10, t11, t12, t13 = T[1, 0], T[1, 1], T[1, 2], T[1, 3]
     t20, t21, t22, t23 = T[2, 0], T[2, 1], T[2, 2], T[2, 3]
-    scale, left, top = drum.pixels_per_rad, drum.azimuth_left + HALF / drum.pixels_per_rad, drum.slope_top
+    scale, top, middle = drum.pixels_per_rad, drum.slope_top, F32(drum.cells.shape[1]) * HALF
     for i in range(width):
         px, py, pz = rows[X + i], rows[Y + i], rows[Z + i]
         x = t00 * px + t01 * py + t02 * pz + t03
         y = t10 * px + t11 * py + t12 * pz + t13
         z = t20 * px + t21 * py + t22 * pz + t23
         distance = F32(np.sqrt(max(x * x + y * y, F32(1e-12))))
-        turned = left - _azimuth(x, y)
-        turned -= _TURN * F32(np.floor(turned / _TURN))
         rows[_DISTANCE + i] = distance
-        rows[_COLUMN + i] = turned * scale
+        rows[_COLUMN + i] = middle - _azimuth(x, y, distance) * scale
         rows[_ROW + i] = (top - z / distance) * scale + HALF
 
 
 @inlined
-def _draw_row(camera: int, width: np.uint64, drum: Drum, rows: Array32, places: I32) -> None:
-    """Each point's cell of the window, its distance in units, and its weight as a byte."""
-    columns, lines = np.int32(drum.cells.shape[1]), np.int32(drum.cells.shape[2])
-    start, circle, bottom = np.int32(drum.starts[camera]), np.int32(drum.circle), F32(drum.cells.shape[2])
-    for i in range(width):
-        column = np.int32(rows[_COLUMN + i]) - start
-        column = column + circle if column < np.int32(0) else column
-        row = np.int32(min(max(rows[_ROW + i], -ONE), bottom))
-        drawn = (column < columns) & (row < lines) & (rows[_ROW + i] >= ZERO)
-        places[_CELL + i] = column * lines + row if drawn else np.int32(-1)
-        square = (
-            rows[_DISTANCE + i] * rows[_DISTANCE + i]
-        )  # undoes q⁴: both cameras of a seam are equally far
-        part = rows[WEIGHT + i] * square * square * _SHARE
-        places[_PART + i] = np.int32(min(max(part, ONE), _FULL))
-        places[_UNITS + i] = np.int32(min(rows[_DISTANCE + i], F32(1e4)) * UNITS_A_METRE)
+def _azimuth(x: F32, y: F32, distance: F32) -> F32:
+    """atan2(y, x) to 4e-5 rad: twice the angle whose tangent is y / (distance + x), which takes no quadrants.
+
+    That angle by Abramowitz & Stegun 4.4.49, or the complement of its complement.
+    """
+    rise, run = abs(y), max(distance + x, F32(1e-9))
+    steep = rise > run
+    a = (run if steep else rise) / (rise if steep else run)
+    s = a * a
+    series = F32(-0.3302995) + s * (F32(0.1801410) + s * (F32(-0.0851330) + s * F32(0.0208351)))
+    half = a * (F32(0.9998660) + s * series)
+    angle = _PI - TWO * half if steep else TWO * half
+    return -angle if y < ZERO else angle
 
 
 @inlined
-def _azimuth(x: F32, y: F32) -> F32:
-    """atan2(y, x) to 2e-5 rad without a branch (Abramowitz & Stegun 4.4.49)."""
-    ax, ay = abs(x), abs(y)
-    steep = ay > ax
-    a = (ax if steep else ay) / max(ay if steep else ax, F32(1e-9))
-    s = a * a
-    series = F32(-0.3302995) + s * (F32(0.1801410) + s * (F32(-0.0851330) + s * F32(0.0208351)))
-    angle = a * (F32(0.9998660) + s * series)
-    angle = (_HALF_PI if steep else ZERO) + (-angle if steep else angle)
-    angle = (_PI if x < ZERO else ZERO) + (-angle if x < ZERO else angle)
-    return -angle if y < ZERO else angle
+def _draw_row(width: np.uint64, drum: Drum, rows: Array32, places: I32) -> None:
+    """Each point's cell of the window, its distance in units, and its weight as a byte."""
+    columns, lines = F32(drum.cells.shape[1]), F32(drum.cells.shape[2])
+    line = np.int32(drum.cells.shape[2])
+    for i in range(width):
+        column, row = rows[_COLUMN + i], rows[_ROW + i]
+        drawn = (column >= ZERO) & (column < columns) & (row >= ZERO) & (row < lines)
+        cell = np.int32(min(max(column, ZERO), columns)) * line + np.int32(min(max(row, ZERO), lines))
+        places[_CELL + i] = cell if drawn else np.int32(-1)
+        # The fourth power undoes q⁴: both cameras of a seam are equally far.
+        square = rows[_DISTANCE + i] * rows[_DISTANCE + i]
+        part = rows[WEIGHT + i] * square * square * _SHARE
+        places[_PART + i] = np.int32(min(max(part, ONE), _FULL))
+        places[_UNITS + i] = np.int32(min(rows[_DISTANCE + i], F32(1e4)) * UNITS_A_METRE)
 
 
 @inlined

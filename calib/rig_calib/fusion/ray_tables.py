@@ -165,15 +165,24 @@ def drum_around(grids: Sequence[PlacedGrid], T_view_rig: Pose, cylinder: Cylinde
     """The cylinder for the kernels, with a window for every camera, as wide as the widest needs."""
     windows = [_window(grid, T_view_rig, cylinder, circle_px) for grid in grids]
     width = min(max(width for _, width in windows), circle_px)
+    starts = np.array([start for start, _ in windows], np.int64)
+    # A pixel's centre is at an integer: half a pixel more, and columns are cut.
+    middles = cylinder.azimuth_left_rad + (0.5 - starts - width / 2) / cylinder.pixels_per_rad
+    T_window_rig = np.array([_turned(angle) @ T_view_rig[:3] for angle in middles], np.float32)
     return Drum(
-        T_view_rig=np.ascontiguousarray(T_view_rig[:3], dtype=np.float32),
-        azimuth_left=np.float32(cylinder.azimuth_left_rad),
+        T_window_rig=T_window_rig,
         pixels_per_rad=np.float32(cylinder.pixels_per_rad),
         slope_top=np.float32(cylinder.slope_top),
         circle=circle_px,
-        starts=np.array([start for start, _ in windows], np.int64),
+        starts=starts,
         cells=np.full((len(grids), width, cylinder.height), EMPTY, np.uint64),
     )
+
+
+def _turned(angle_rad: float) -> Array:
+    """Rotation (3,3) that maps what is at this azimuth to the x axis."""
+    c, s = np.cos(angle_rad), np.sin(angle_rad)
+    return np.array([[c, s, 0.0], [-s, c, 0.0], [0.0, 0.0, 1.0]])
 
 
 def _window(grid: PlacedGrid, T_view_rig: Pose, cylinder: Cylinder, circle_px: int) -> tuple[int, int]:
