@@ -2,9 +2,9 @@
 
 python tests/benchmarks/console_latency.py [--seconds 20] [--cameras 12] [--fps 30]
 
-Prints JSON, into build/bench.json and docs/performance.md, too: percentiles in ms, and `skipped` with the reason where there is no Chromium. Cameras, server and
-browser share this machine. There is no calibration, and so no cloud: without a GPU it is drawn in software,
-which would be measured. Median and 95th percentile are in the page's footer, too. The bar is 200 ms.
+Prints JSON, into build/bench.json and docs/performance.md, too: percentiles in ms, and `skipped` with the
+reason where there is no Chromium. Cameras, server and browser share this machine. There is no calibration,
+and so no cloud: without a GPU it is drawn in software, which would be measured. The bar is 200 ms.
 """
 
 import argparse
@@ -115,9 +115,10 @@ def report(results: dict[str, Any]) -> str:
         return f"## Console\n\nNot measured: {results['skipped']}."
     return f"""## Console
 
-`python tests/benchmarks/console_latency.py` on {machine("aiohttp", "playwright")}; load {results["load_before"]:.1f}
-before. {results["cameras"]} cameras at {results["fps"]:.0f} frames a second, a headless Chromium that looks at all tiles, all on
-this machine. From a frame's last datagram to its painted tile, the page's word back included: median
+`python tests/benchmarks/console_latency.py` on {machine("aiohttp", "playwright")};
+load {results["load_before"]:.1f} before. {results["cameras"]} cameras at {results["fps"]:.0f} frames/s,
+a headless Chromium that looks at all tiles, all on this machine. From a frame's last datagram to its
+painted tile, the page's word back included: median
 **{results["p50_ms"]:.0f} ms**, 95 % **{results["p95_ms"]:.0f} ms**, 99 % {results["p99_ms"]:.0f} ms;
 {results["tiles_per_s"]:.0f} tiles and {results["sets_per_s"]:.1f} sets a second."""
 
