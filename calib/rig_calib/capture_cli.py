@@ -144,6 +144,13 @@ def export(
     first: Annotated[int, typer.Option(min=0, help="Of frames: leave out so many at the beginning.")] = 0,
     every: Annotated[int, typer.Option(min=1, help="Of frames: one in so many.")] = 1,
     fps: Annotated[float, typer.Option(min=0.1, max=240, help="Of a video: frames a second.")] = 30.0,
+    centre: Annotated[
+        str | None,
+        typer.Option(metavar="X,Y,Z", help="Of panoramas: seen from there, metres in the rig frame."),
+    ] = None,
+    match_colors: Annotated[
+        bool, typer.Option("--match-colors", help="Make cameras of different exposure agree.")
+    ] = False,
     workers: WorkerCount = None,
     scheduler: Scheduler = None,
 ) -> None:
@@ -170,8 +177,8 @@ def export(
             calibration,
             slice(first, None if frames is None else first + frames * every, every),
             fps,
-            workers,
-            scheduler,
+            (centre, match_colors),
+            (workers, scheduler),
         )
     else:
         _export_calibration(console, form, source, out, rig, frames or 1)
@@ -206,11 +213,11 @@ def _export_frames(
     calibration: Path | None,
     chosen: slice,
     fps: float,
-    workers: int | None,
-    scheduler: str | None,
+    look: tuple[str | None, bool],
+    hands: tuple[int | None, str | None],
 ) -> None:
     from rig_calib.frame_exports.formats import FORMATS
-    from rig_calib.frame_exports.job import ExportJob
+    from rig_calib.frame_exports.job import ExportJob, FusionLook
     from rig_calib.offline.capture import open_capture
     from rig_calib.offline.workers import open_workers
     from rig_calib.rig_calibration import RigCalibration
@@ -224,14 +231,27 @@ def _export_frames(
         raise ConfigurationError(f"{path} holds {len(capture.marks)} panoramic frames: none is left")
     chosen_format.check(out, len(positions))
     known = capture.calibration if calibration is None else RigCalibration.load(calibration)
-    with progress_bar(console) as tell, open_workers(workers, scheduler) as hands:
-        exported = exporter(
-            ExportJob(capture, positions, out, hands, known, fps, lambda share: tell(form, share))
-        )
+    seen = FusionLook(_centre_m(look[0]), look[1])
+    with progress_bar(console) as tell, open_workers(*hands) as workers:
+        job = ExportJob(capture, positions, out, workers, known, fps, seen, lambda share: tell(form, share))
+        exported = exporter(job)
     for written in exported.paths:
         console.print(str(written), markup=False)
     for note in exported.notes:
         console.print(note, style="yellow", markup=False)
+
+
+def _centre_m(text: str | None) -> tuple[float, float, float] | None:
+    """ConfigurationError for what are not three numbers."""
+    from rig_protocol.errors import ConfigurationError
+
+    if text is None:
+        return None
+    try:
+        x, y, z = (float(word) for word in text.split(","))
+    except ValueError:
+        raise ConfigurationError(f"--centre {text}: write three numbers in metres, as 0,0,1.2") from None
+    return x, y, z
 
 
 def add_capture_commands(app: typer.Typer) -> None:

@@ -145,6 +145,8 @@ class ConsoleSettings(Settings):
     """How often a second sets are fused for cloud and panorama, while a page looks: some 100 ms of a core."""
     cloud_points: int = Field(80_000, ge=100, le=2_000_000)
     """Points of the cloud that pages are sent, thinned evenly; a point takes 9 bytes."""
+    match_colors: bool = False
+    """Cloud and panorama make cameras of different exposure agree, by the first set: hold the exposures."""
     folder: Path = Path("calibration")
     """Where an accepted calibration is written, and where a live rig's console finds that of last time."""
 

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
-from rig_calib.frame_exports.fused_batches import borrowed_fusion, usual_settings
+from rig_calib.frame_exports.fused_batches import borrowed_fusion, settings_of
 from rig_calib.frame_exports.job import Exported, ExportJob
 from rig_calib.frame_exports.placed_cameras import placed_cameras, unplaced_notes
 from rig_calib.frame_exports.time_stamps import TimeStamps
@@ -95,7 +95,7 @@ def notes_of(job: ExportJob, skipped: Counter[str]) -> tuple[str, ...]:
 
 
 def _write_scenes(job: ExportJob, write: WriteScene, path_of: Callable[[int], Path]) -> tuple[str, ...]:
-    calibration, settings = job.needed_calibration(), usual_settings(job.capture)
+    calibration, settings = job.needed_calibration(), settings_of(job)
     writer = _Writer(write, path_of, calibration, settings, TimeStamps.of(job.capture).utc_minus_rig_ns)
     skipped: Counter[str] = Counter()
     for own in job.workers.map(writer, batches_of(job.capture, job.positions, BATCH_FRAMES), job.tell):

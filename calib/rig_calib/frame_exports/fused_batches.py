@@ -3,12 +3,15 @@
 import os
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from threading import Lock
 
 import numba
+import numpy as np
 
 from rig_calib.frame_exports.content_hash import content_hash
+from rig_calib.frame_exports.job import ExportJob
+from rig_calib.fusion.gains import frame_gains
 from rig_calib.fusion.live import FusedFrame, LiveFusion, LiveFusionSettings
 from rig_calib.offline.capture import Capture
 from rig_calib.offline.workers import Batch
@@ -46,7 +49,7 @@ def borrowed_fusion(
     content = {
         "calibration": calibration.to_dict(),
         "models": {camera_id: model.to_dict() for camera_id, model in models.items()},
-        "settings": asdict(chosen),
+        "settings": asdict(chosen) | {"gains": {i: np.asarray(g).tolist() for i, g in chosen.gains.items()}},
     }
     key = content_hash(content)
     fusion = _taken(key) or LiveFusion(calibration, models, chosen)
@@ -56,6 +59,16 @@ def borrowed_fusion(
         fusion.close()
         raise
     _give_back(key, fusion)
+
+
+def settings_of(job: ExportJob) -> LiveFusionSettings:
+    """How the frames of a job are fused; DataError where the file is damaged."""
+    settings = replace(usual_settings(job.capture), centre_m=job.look.centre_m)
+    if not job.look.match_colors:
+        return settings
+    first = next(job.capture.read(job.positions[:1]), None)
+    gains = {} if first is None else frame_gains(job.capture.description, first, job.needed_calibration())
+    return replace(settings, gains=gains)
 
 
 def usual_settings(capture: Capture) -> LiveFusionSettings:

@@ -10,6 +10,17 @@ from rig_calib.rig_calibration import RigCalibration
 from rig_protocol.errors import ConfigurationError
 
 
+@dataclass(frozen=True, slots=True)
+class FusionLook:
+    """How fused frames shall look: seen from `centre_m` in the rig frame, by default amid the cameras.
+
+    `match_colors`: cameras of different exposure are made to agree, by the job's first frame.
+    """
+
+    centre_m: tuple[float, float, float] | None = None
+    match_colors: bool = False
+
+
 @dataclass(frozen=True, slots=True, eq=False)
 class ExportJob:
     """Positions of a capture, to `out`: a file or a folder, as the format has it.
@@ -23,6 +34,7 @@ class ExportJob:
     workers: Workers
     calibration: RigCalibration | None = None
     fps: float = 30.0
+    look: FusionLook = FusionLook()  # frozen
     tell: Tell = field(default=lambda _share: None)
 
     def needed_calibration(self) -> RigCalibration:

@@ -9,10 +9,10 @@ import numpy as np
 import numpy.typing as npt
 
 from rig_calib.frame_exports.depth_images import depth_image, has_depth
-from rig_calib.frame_exports.fused_batches import fused_batch
+from rig_calib.frame_exports.fused_batches import fused_batch, settings_of
 from rig_calib.frame_exports.job import ExportJob
 from rig_calib.frame_exports.placed_cameras import PlacedCamera, views_by_id
-from rig_calib.fusion.live import FusedFrame
+from rig_calib.fusion.live import FusedFrame, LiveFusionSettings
 from rig_calib.fusion.voxels import voxel_keys
 from rig_calib.offline.workers import Batch, batches_of
 from rig_calib.rig_calibration import RigCalibration
@@ -58,19 +58,23 @@ class ShownFrame:
 
 def shown_frames(job: ExportJob, cameras: Sequence[PlacedCamera]) -> Iterator[ShownFrame]:
     """Every panoramic frame of the job in its order, made by its workers, a few held at a time."""
-    work = partial(_shown_batch, cameras=cameras, calibration=job.needed_calibration())
+    calibration, settings = job.needed_calibration(), settings_of(job)
+    work = partial(_shown_batch, cameras=cameras, calibration=calibration, settings=settings)
     batches = batches_of(job.capture, job.positions, _BATCH)
     for frames in job.workers.map(work, batches, job.tell):
         yield from frames
 
 
 def _shown_batch(
-    batch: Batch, cameras: Sequence[PlacedCamera], calibration: RigCalibration
+    batch: Batch,
+    cameras: Sequence[PlacedCamera],
+    calibration: RigCalibration,
+    settings: LiveFusionSettings,
 ) -> list[ShownFrame]:
     description = batch.capture.description
     return [
         _shown_frame(description, cameras, panorama, fused)
-        for panorama, fused in fused_batch(batch, calibration)
+        for panorama, fused in fused_batch(batch, calibration, settings)
     ]
 
 

@@ -15,7 +15,7 @@ from av.video.reformatter import ColorPrimaries, ColorRange, Colorspace, ColorTr
 from av.video.stream import VideoStream
 
 from rig_calib.frame_exports.frame_files import BATCH_FRAMES, make_folder_of, notes_of
-from rig_calib.frame_exports.fused_batches import borrowed_fusion, usual_settings
+from rig_calib.frame_exports.fused_batches import borrowed_fusion, settings_of
 from rig_calib.frame_exports.job import Exported, ExportJob
 from rig_calib.frame_exports.panorama_geometry import panorama_geometry
 from rig_calib.fusion.live import LiveFusionSettings
@@ -68,7 +68,7 @@ def export(job: ExportJob) -> Exported:
     if codec is None:
         raise ConfigurationError(f"{job.out} must end with .mp4 (H.264) or .mkv (lossless FFV1)")
     refuse_existing(job.out)
-    draw = partial(_draw, calibration=job.needed_calibration(), settings=usual_settings(job.capture))
+    draw = partial(_draw, calibration=job.needed_calibration(), settings=settings_of(job))
     make_folder_of(job.out)
     drawn = job.workers.map(draw, batches_of(job.capture, job.positions, BATCH_FRAMES), job.tell)
     with whole_file(job.out) as file:

@@ -8,9 +8,13 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 
-from rig_calib.fusion.surface import Surface
+from rig_calib.fusion.surface import Surface, camera_surfaces
 from rig_calib.fusion.voxels import Array, Keys, sum_by_key, voxel_keys
+from rig_calib.rig_calibration import RigCalibration
+from rig_calib.view import views_from_panoramas
+from rig_protocol.frames import PanoramicFrame
 from rig_protocol.poses import Pose
+from rig_protocol.rig_folder import RigDescription
 
 Gain = Array
 
@@ -44,6 +48,15 @@ def color_gains(surfaces: Sequence[Surface], poses: Mapping[int, Pose]) -> dict[
     log_gains = np.linalg.lstsq(np.array(rows), np.array(ratios), rcond=None)[0]
     log_gains -= log_gains.mean(axis=0)
     return {surface.camera_id: np.exp(gain) for surface, gain in zip(surfaces, log_gains, strict=True)}
+
+
+def frame_gains(
+    description: RigDescription, panorama: PanoramicFrame, calibration: RigCalibration
+) -> dict[int, Gain]:
+    """The gains by one panoramic frame; takes a second or two for twelve cameras."""
+    views = views_from_panoramas(description, [panorama])
+    surfaces, _ = camera_surfaces(views, calibration)
+    return color_gains(surfaces, calibration.poses)
 
 
 def _cell_colors(surface: Surface, T_rig_camera: Pose) -> tuple[Keys, Array]:

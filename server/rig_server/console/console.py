@@ -107,7 +107,13 @@ class RigConsole:
         self._tiles = LatestOnly[tuple[PanoramicFrame, int]](
             "tiles", self._make_tiles, 1 / settings.tile_hz, _TILE_NICENESS
         )
-        self._fuse = FuseSink(self._calibration, lambda: rig.description, self._show, 1 / settings.fused_hz)
+        self._fuse = FuseSink(
+            self._calibration,
+            lambda: rig.description,
+            self._show,
+            1 / settings.fused_hz,
+            match_colors=settings.match_colors,
+        )
 
     def __enter__(self) -> Self:
         """Begin."""

@@ -4,6 +4,7 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 
+from rig_calib.fusion.gains import frame_gains
 from rig_calib.fusion.live import FusedFrame, LiveFusion, LiveFusionSettings
 from rig_calib.rig_calibration import RigCalibration
 from rig_protocol.camera import CameraModel
@@ -44,10 +45,14 @@ class FuseSink:
         listener: Callable[[FusedFrame], None],
         every_s: float = 0.0,
         settings: LiveFusionSettings | None = None,
+        match_colors: bool = False,
     ) -> None:
-        """`calibration`: the one in force, None where there is none; asked for before every set."""
+        """`calibration`: the one in force, None where there is none; asked for before every set.
+
+        `match_colors`: cameras of different exposure are made to agree, by the first set after each change.
+        """
         self._calibration, self._description, self._listener = calibration, description, listener
-        self._settings = settings or LiveFusionSettings()
+        self._settings, self._match_colors = settings or LiveFusionSettings(), match_colors
         self._worker = LatestOnly[PanoramicFrame]("live fusion", self._take, every_s, _NICENESS)
         self._fusion: LiveFusion | None = None
         self._made_of: tuple[RigCalibration, DepthFrame] | None = None
@@ -102,8 +107,11 @@ class FuseSink:
         if same and _alike(models, self._models):
             return
         self._close_fusion()
+        settings = replace(self._settings, depth_frame=made_of[1])
         try:
-            self._fusion = LiveFusion(calibration, models, replace(self._settings, depth_frame=made_of[1]))
+            if self._match_colors:
+                settings = replace(settings, gains=frame_gains(self._description(), panorama, calibration))
+            self._fusion = LiveFusion(calibration, models, settings)
         except DataError as error:  # until something changes
             self._report = replace(self._report, trouble=str(error), skipped=())
         self._made_of, self._models = made_of, models

@@ -2,15 +2,18 @@
 
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing
+from dataclasses import replace
+from pathlib import Path
 from threading import Barrier
 
 import numpy as np
 import pytest
 
-from rig_calib.frame_exports.fused_batches import borrowed_fusion, fused_batch
+from rig_calib.frame_exports.fused_batches import borrowed_fusion, fused_batch, settings_of
+from rig_calib.frame_exports.job import ExportJob, FusionLook
 from rig_calib.fusion.live import LiveFusion, LiveFusionSettings
 from rig_calib.offline.capture import Capture, open_capture
-from rig_calib.offline.workers import Batch, batches_of
+from rig_calib.offline.workers import Batch, ThisProcess, batches_of
 from support.box_room import MODEL, calibration_of, ring_poses
 from support.room_capture import write_room_capture
 
@@ -68,3 +71,18 @@ def test_a_batch_that_nobody_reads_to_its_end_hinders_no_other(capture: Capture)
     with closing(fused_batch(Batch(capture, range(3)), CALIBRATION, SMALL)) as batch:
         next(batch)
     assert len(panoramas_of(Batch(capture, range(3)))) == 3
+
+
+def test_cameras_of_different_exposure_are_matched_where_a_job_asks_for_it(tmp_path: Path) -> None:
+    capture = open_capture(write_room_capture(tmp_path / "dark", 1, exposures={1: 0.5}))
+    job = ExportJob(capture, range(1), tmp_path, ThisProcess(), CALIBRATION)
+    assert not settings_of(job).gains
+    gains = settings_of(replace(job, look=FusionLook(match_colors=True))).gains
+    for neighbour in (0, 2):
+        np.testing.assert_allclose(gains[1] / gains[neighbour], 2.0, rtol=0.1)
+
+
+def test_a_jobs_panorama_is_seen_from_where_it_says(capture: Capture, tmp_path: Path) -> None:
+    job = ExportJob(capture, range(1), tmp_path, ThisProcess(), CALIBRATION, look=FusionLook((0.5, 0.0, 0.2)))
+    with borrowed_fusion(capture, CALIBRATION, settings_of(job)) as fusion:
+        np.testing.assert_allclose(fusion.T_rig_view[:3, 3], (0.5, 0.0, 0.2))

@@ -27,6 +27,9 @@ def frame_of(camera_id: int) -> RgbdFrame:
 PANORAMA = PanoramicFrame.of(0, {camera_id: frame_of(camera_id) for camera_id in POSES})
 
 
+KNOWN = calibration_of(POSES)
+
+
 def described(model: CameraModel = MODEL) -> RigDescription:
     return RigDescription(tuple(CameraEntry(i, f"cam{i:02d}", model) for i in POSES))
 
@@ -129,3 +132,23 @@ def test_a_set_that_lacks_cameras_gives_way_to_a_full_one_of_the_same_second(ben
     bench.sink.offer(lacking)
     bench.fuse()
     assert bench.skipped == [(), ()]
+
+
+def test_colours_are_matched_where_it_is_asked_for() -> None:
+    dark = frame_of(1)
+    assert dark.color is not None
+    panorama = PanoramicFrame.of(0, {**PANORAMA.frames, 1: replace(dark, color=dark.color // 2)})
+    means: dict[bool, np.ndarray] = {}
+
+    def take(frame: FusedFrame) -> None:
+        owner = np.repeat(frame.camera_ids, np.diff(frame.starts))
+        means[matched] = frame.colors[owner == 1].mean(axis=0)
+
+    for matched in (False, True):
+        sink = FuseSink(
+            lambda: calibration_of(POSES), described, take, settings=SETTINGS, match_colors=matched
+        )
+        sink.start()
+        sink.offer(panorama)
+        sink.stop()  # when the set was taken
+    assert (means[True] > 1.3 * means[False]).all()
