@@ -1,11 +1,12 @@
 """LiveFusion: one cloud and one RGB-D panorama a panoramic frame, at the cameras' rate."""
 
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from queue import SimpleQueue
 from types import TracebackType
-from typing import Self
+from typing import Self, TypeVar
 
 import cv2
 import numpy as np
@@ -39,6 +40,7 @@ from rig_protocol.frames import DepthFrame, ImageU8, ImageU16, PanoramicFrame, R
 from rig_protocol.poses import Pose, inverse
 
 Array32 = npt.NDArray[np.float32]
+Tool = TypeVar("Tool")
 
 _BAND_COLUMNS = 128  # of the panorama, blended by one thread at a time
 _CLOUD = -1  # the work beside the bands
@@ -66,6 +68,8 @@ class LiveFusionSettings:
             raise ConfigurationError(f"circle_px is {self.circle_px}, must be 16 to 20000")
         if not 1 <= self.threads <= 64:
             raise ConfigurationError(f"threads is {self.threads}, must be 1 to 64")
+        if self.centre_m is not None and not np.isfinite(self.centre_m).all():
+            raise ConfigurationError(f"centre_m is {self.centre_m}, must be three numbers, metres")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -138,16 +142,18 @@ class LiveFusion:
         models: Mapping[int, CameraModel],
         settings: LiveFusionSettings | None = None,
     ) -> None:
-        """Tables for every camera that has a pose and a model.
+        """Tables for every camera that has a pose and a model of its depth camera; others are skipped.
 
-        DataError when none has, when a model lacks its depth camera, or when depth images differ in size.
+        DataError when none has, or when depth images differ in size; ConfigurationError for a panorama of
+        too many rows.
         """
         self.settings = settings or LiveFusionSettings()
         placed = {camera_id: T for camera_id, T in calibration.poses.items() if camera_id in models}
         if not placed:
             raise DataError("no camera has both a pose in the calibration and a model: nothing can be fused")
-        self.camera_ids = tuple(sorted(placed))
-        grids = [self._grid(calibration, models, camera_id) for camera_id in self.camera_ids]
+        by_id, self._left_out = self._usable_grids(calibration, models, placed)
+        self.camera_ids = tuple(by_id)
+        grids = list(by_id.values())
         if len({grid.shape for grid in grids}) > 1:
             raise DataError("live fusion takes cameras whose depth images are all of one size")
         if grids[0].shape[1] > MAX_WIDTH:
@@ -159,6 +165,11 @@ class LiveFusion:
         self.T_rig_view: Pose = view
         circle_px = self.settings.circle_px
         self.cylinder: Cylinder = circle_around(grids, inverse(view), circle_px)
+        if self.cylinder.height > MAX_WIDTH:
+            raise ConfigurationError(
+                f"circle_px {circle_px} makes a panorama of {self.cylinder.height} rows: "
+                f"take at most {circle_px * MAX_WIDTH // self.cylinder.height}"
+            )
         self._ring: Ring = ring_tables(grids)
         self._drum: Drum = drum_around(grids, inverse(view), self.cylinder, circle_px)
         self._lenses: list[Lens] = [grid.lens() for grid in grids]
@@ -186,7 +197,7 @@ class LiveFusion:
     def fuse(self, panorama: PanoramicFrame) -> FusedFrame:
         """Cloud and panorama of one frame, valid until the next call; a camera that fails is in `skipped`."""
         images: list[_Images | None] = []
-        skipped: list[str] = []
+        skipped = list(self._left_out)
         for k, camera_id in enumerate(self.camera_ids):
             found = self._images(k, panorama.frames.get(camera_id))
             images.append(None if isinstance(found, str) else found)
@@ -217,6 +228,21 @@ class LiveFusion:
     def T_rig_depth(self) -> dict[int, Pose]:
         """Where every camera's depth image is seen from, by camera id."""
         return {i: grid.T_rig_grid for i, grid in zip(self.camera_ids, self._grids, strict=True)}
+
+    def _usable_grids(
+        self, calibration: RigCalibration, models: Mapping[int, CameraModel], placed: Iterable[int]
+    ) -> tuple[dict[int, PlacedGrid], tuple[str, ...]]:
+        """By camera id, and a sentence for every other; DataError when there are only others."""
+        grids: dict[int, PlacedGrid] = {}
+        left_out: list[str] = []
+        for camera_id in sorted(placed):
+            try:
+                grids[camera_id] = self._grid(calibration, models, camera_id)
+            except DataError as error:
+                left_out.append(f"camera {camera_id}: left out, {error}")
+        if not grids:
+            raise DataError("; ".join(left_out))
+        return grids, tuple(left_out)
 
     def _grid(
         self, calibration: RigCalibration, models: Mapping[int, CameraModel], camera_id: int
@@ -273,31 +299,29 @@ class LiveFusion:
         if images is None:  # its partners look here, too
             self._measured[k] = NOTHING
             return
-        scratch = self._scratches.get()
         measured = self._measured[k]
-        clean_depth(images.depth, images.in_mm, self._lenses[k], self._ring.scales[k], scratch, measured)
-        self._scratches.put(scratch)
+        with _taken_from(self._scratches) as scratch:
+            clean_depth(images.depth, images.in_mm, self._lenses[k], self._ring.scales[k], scratch, measured)
 
     def _place(self, k: int, images: "_Images | None") -> None:
         if images is None:
             self._counts[k] = 0
             return
-        scratch = self._scratches.get()
-        pack_colors(images.color, images.kind, self._gains[k], scratch.quads)
         own = slice(k * self._capacity, (k + 1) * self._capacity)
-        self._counts[k] = place_points(
-            k,
-            self._measured,
-            self._ring,
-            self._drum,
-            images.size,
-            images.kind,
-            int(self._ring.scans[k]),
-            scratch,
-            self._points[own],
-            self._colors[own],
-        )
-        self._scratches.put(scratch)
+        with _taken_from(self._scratches) as scratch:
+            pack_colors(images.color, images.kind, self._gains[k], scratch.quads)
+            self._counts[k] = place_points(
+                k,
+                self._measured,
+                self._ring,
+                self._drum,
+                images.size,
+                images.kind,
+                int(self._ring.scans[k]),
+                scratch,
+                self._points[own],
+                self._colors[own],
+            )
 
     def _finish(self, first: int) -> None:
         """The cloud, or a band of columns of the panorama."""
@@ -305,13 +329,21 @@ class LiveFusion:
             np.cumsum(self._counts, out=self._starts[1:])
             close_ranks(self._points, self._colors, self._capacity, self._counts)
             return
-        scratch, strip = self._scratches.get(), self._strips.get()
         last = min(first + _BAND_COLUMNS, self.cylinder.width)
-        colors, depths = strip.colors[: last - first], strip.depths[: last - first]
-        blend_columns(first, last, self._drum, self._present, scratch.rows, colors, depths)
-        strip.write(self._panorama[:, first:last], self._panorama_depth[:, first:last])
-        self._scratches.put(scratch)
-        self._strips.put(strip)
+        with _taken_from(self._scratches) as scratch, _taken_from(self._strips) as strip:
+            colors, depths = strip.colors[: last - first], strip.depths[: last - first]
+            blend_columns(first, last, self._drum, self._present, scratch.rows, colors, depths)
+            strip.write(self._panorama[:, first:last], self._panorama_depth[:, first:last])
+
+
+@contextmanager
+def _taken_from(tools: "SimpleQueue[Tool]") -> Iterator[Tool]:
+    """One of them, which goes back whatever happens: the next frame waits for it."""
+    tool = tools.get()
+    try:
+        yield tool
+    finally:
+        tools.put(tool)
 
 
 def _scratch(shape: tuple[int, int], color_pixels: int) -> Scratch:

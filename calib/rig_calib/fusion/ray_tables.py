@@ -13,7 +13,7 @@ from rig_calib.depth_model import MAX_RANGE_M, MIN_RANGE_M, DepthCorrection, Dep
 from rig_calib.fusion.cylinder import Cylinder, fit_cylinder
 from rig_calib.fusion.live_arrays import EMPTY, UNSEEN, Drum, Lens, Ring
 from rig_calib.fusion.visibility import in_field
-from rig_calib.projection import from_pixels, inside, pixel_rays, project
+from rig_calib.projection import from_pixels, pixel_rays, project
 from rig_protocol.camera import CameraModel, Intrinsics
 from rig_protocol.frames import DepthFrame
 from rig_protocol.poses import Pose, inverse, transform_points
@@ -23,7 +23,7 @@ Array32 = npt.NDArray[np.float32]
 
 MAX_PARTNERS = 8
 _BLOCK_PX = 8  # shared views are found at every eighth pixel, and widened by as much
-_RANGES_M = np.array([MIN_RANGE_M, 0.55, 0.8, 1.2, 2.0, 4.0, MAX_RANGE_M])
+_RANGE_M = np.array([MIN_RANGE_M, MAX_RANGE_M])
 _USUAL_RANGES_M = np.array([1.0, 2.0, 4.0])  # where the panorama's border is to be right
 _COLOR_RANGES_M = (0.55, MAX_RANGE_M)
 _LARGEST = 32_000  # number in a table of 16 bits
@@ -97,17 +97,33 @@ class PlacedGrid:
         return pixels
 
     def points(self, ranges_m: Array, step: int) -> Array:
-        """Points (R,h,w,3) of the rig frame at every `step`-th pixel and some depths; NaN without a ray."""
-        rays = self.rays()[::step, ::step]
-        turned = rays @ self.T_rig_grid[:3, :3].T
+        """Points (R,h,w,3) of the rig frame at every `step`-th pixel and some depths; NaN without a ray.
+
+        The last row and column are among them.
+        """
+        rows, columns = (np.unique(np.append(np.arange(0, n, step), n - 1)) for n in self.shape)
+        turned = self.rays()[np.ix_(rows, columns)] @ self.T_rig_grid[:3, :3].T
         return np.asarray(ranges_m[:, None, None, None] * turned + self.T_rig_grid[:3, 3])
 
-    def sees(self, points: Array) -> npt.NDArray[np.bool_]:
-        """Which points (..., 3) of the rig frame fall on its depth image, or nearly."""
-        local = transform_points(inverse(self.T_rig_grid), points.reshape(-1, 3))
-        seen = in_field(self.grid.intrinsics, local)
-        seen[seen] = inside(self.grid.intrinsics, project(self.grid.intrinsics, local[seen]), _BLOCK_PX)
-        return seen.reshape(points.shape[:-1])
+    def sees_along(self, near: Array, far: Array) -> npt.NDArray[np.bool_]:
+        """Which lines (...) from near to far points (..., 3) of the rig frame pass its view, or nearly."""
+        sides = self._sides() @ self.T_rig_grid[:3, :3].T
+        begin, end = ((points - self.T_rig_grid[:3, 3]) @ sides.T for points in (near, far))
+        with np.errstate(divide="ignore", invalid="ignore"):  # of lines along a side
+            crossing = begin / (begin - end)
+        enters = np.where(begin >= 0, 0.0, np.where(end >= 0, crossing, np.inf)).max(axis=-1)
+        leaves = np.where(end >= 0, 1.0, np.where(begin >= 0, crossing, -np.inf)).min(axis=-1)
+        return np.asarray((enters <= leaves) & np.isfinite(begin + end).all(axis=-1))
+
+    def _sides(self) -> Array:
+        """Inward normals (4,3), in its own frame, of the planes around its view, some pixels wider."""
+        rays, lens = pixel_rays(self.grid.intrinsics), self.grid.intrinsics
+        margin = _BLOCK_PX / np.array([lens.fx, lens.fy])
+        (left, top), (right, bottom) = (
+            np.nanmin(rays, axis=(0, 1)) - margin,
+            np.nanmax(rays, axis=(0, 1)) + margin,
+        )
+        return np.array([[1.0, 0.0, -left], [-1.0, 0.0, right], [0.0, 1.0, -top], [0.0, -1.0, bottom]])
 
 
 def ring_tables(grids: Sequence[PlacedGrid]) -> Ring:
@@ -187,11 +203,16 @@ def _turned(angle_rad: float) -> Array:
 
 def _window(grid: PlacedGrid, T_view_rig: Pose, cylinder: Cylinder, circle_px: int) -> tuple[int, int]:
     """First column and number of columns of the circle on which a camera's points may fall."""
-    points = grid.points(_RANGES_M, _BLOCK_PX).reshape(-1, 3)
-    points = transform_points(T_view_rig, points[np.isfinite(points).all(axis=1)])
-    turned = cylinder.azimuth_left_rad - np.arctan2(points[:, 1], points[:, 0])
-    columns = np.mod(np.floor(turned * cylinder.pixels_per_rad + 0.5).astype(np.int64), circle_px)
-    taken = np.unique(columns)
+    ends = transform_points(T_view_rig, grid.points(_RANGE_M, _BLOCK_PX).reshape(-1, 3)).reshape(2, -1, 3)
+    ends = ends[:, np.isfinite(ends).all(axis=(0, 2))]
+    near, far = np.arctan2(ends[..., 1], ends[..., 0])
+    swept = np.mod(far - near + np.pi, 2 * np.pi) - np.pi  # no line turns by half a circle about an axis
+    turned = (cylinder.azimuth_left_rad - np.maximum(near, near + swept)) * cylinder.pixels_per_rad
+    first = np.mod(np.floor(turned + 0.5).astype(np.int64), circle_px)
+    last = first + np.ceil(np.abs(swept) * cylinder.pixels_per_rad).astype(np.int64)
+    begun, ended = (np.bincount(columns, minlength=2 * circle_px) for columns in (first, last + 1))
+    covered = np.cumsum(begun - ended) > 0
+    taken = np.flatnonzero(covered[:circle_px] | covered[circle_px:])
     gaps = np.diff(taken, append=taken[0] + circle_px)
     widest = int(np.argmax(gaps))
     margin = 2 * _BLOCK_PX
@@ -204,9 +225,10 @@ def _shared_views(grids: Sequence[PlacedGrid]) -> tuple[npt.NDArray[np.int64], n
     """Partners (C,K) of every camera, those that share most first, and spans (C,K,H,2) of columns."""
     partners = np.full((len(grids), MAX_PARTNERS), -1, np.int64)
     spans = np.zeros((len(grids), MAX_PARTNERS, grids[0].shape[0], 2), np.int64)
+    rows, columns = (-(-size // _BLOCK_PX) for size in grids[0].shape)
     for i, grid in enumerate(grids):
-        points = grid.points(_RANGES_M, _BLOCK_PX)
-        masks = {j: _any_of(other.sees(points)) for j, other in enumerate(grids) if j != i}
+        near, far = grid.points(_RANGE_M, _BLOCK_PX)[:, :rows, :columns]
+        masks = {j: other.sees_along(near, far) for j, other in enumerate(grids) if j != i}
         by_share = sorted(
             (j for j in masks if masks[j].any()), key=lambda j: (-np.count_nonzero(masks[j]), j)
         )

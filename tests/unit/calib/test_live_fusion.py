@@ -3,18 +3,20 @@
 import tracemalloc
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
 
 from rig_calib.depth_model import DepthCorrection, disparity_of_depth
 from rig_calib.fusion.live import FusedFrame, LiveFusion, LiveFusionSettings
+from rig_calib.fusion.ray_tables import PlacedGrid, ring_tables
 from rig_calib.fusion.voxels import voxel_keys
 from rig_calib.rig_calibration import RigCalibration
 from rig_protocol.errors import ConfigurationError, DataError
 from rig_protocol.frames import NO_DISPARITY, ImageU8, PanoramicFrame, RgbdFrame
-from rig_protocol.poses import se3_exp
-from support.box_room import MODEL, BoxRoom, calibration_of, ring_poses
+from rig_protocol.poses import inverse, se3_exp, transform_points
+from support.box_room import CAMERA, MODEL, BoxRoom, calibration_of, ring_poses
 
 ROOM = BoxRoom()
 POSES = ring_poses()
@@ -266,6 +268,12 @@ def test_a_rig_that_cannot_be_fused_is_refused_with_the_reason() -> None:
         LiveFusionSettings(circle_px=3)
     with pytest.raises(ConfigurationError, match="threads"):
         LiveFusionSettings(threads=0)
+    with pytest.raises(ConfigurationError, match="centre_m"):
+        LiveFusionSettings(centre_m=(0.0, float("nan"), 1.0))
+    with pytest.raises(
+        ConfigurationError, match=r"circle_px 20000 makes a panorama of \d+ rows: take at most"
+    ):
+        LiveFusion(CALIBRATION, MODELS, replace(SETTINGS, circle_px=20_000))
 
 
 def test_a_turned_rig_gives_a_turned_cloud(whole: FusedFrame) -> None:
@@ -274,3 +282,108 @@ def test_a_turned_rig_gives_a_turned_cloud(whole: FusedFrame) -> None:
     back = (turned.points_m - T[:3, 3]) @ T[:3, :3]
     assert len(back) == pytest.approx(len(whole.points_m), rel=0.005)
     assert np.percentile(ROOM.wall_error_m(back), 95) < 0.003
+
+
+def looking(position_m: tuple[float, float, float], azimuth_deg: float) -> np.ndarray:
+    """T_rig_camera of an upright camera."""
+    c, s = np.cos(np.deg2rad(azimuth_deg)), np.sin(np.deg2rad(azimuth_deg))
+    T = np.eye(4)
+    T[:3, :3] = np.column_stack([(s, -c, 0.0), (0.0, 0.0, -1.0), (c, s, 0.0)])
+    T[:3, 3] = position_m
+    return T
+
+
+def inward_ring(radius_m: float) -> dict[int, np.ndarray]:
+    """Four cameras that look at the axis."""
+    places = {k: np.deg2rad(90.0 * k) for k in range(4)}
+    return {
+        k: looking((radius_m * np.cos(a), radius_m * np.sin(a), 0.1 * k), np.rad2deg(a) + 180)
+        for k, a in places.items()
+    }
+
+
+@pytest.mark.parametrize(
+    ("poses", "settings", "depth_mm"),
+    [
+        (POSES, replace(SETTINGS, centre_m=(1.85, 0.0, 0.0)), 1600),
+        (inward_ring(1.5), SETTINGS, 1550),
+    ],
+    ids=["centre before a camera", "cameras that look across the ring"],
+)
+def test_a_cameras_window_holds_all_that_it_may_measure(
+    poses: dict[int, np.ndarray],
+    settings: LiveFusionSettings,
+    depth_mm: int,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Nothing is lost that a window of the full circle would show."""
+    flat = np.full_like(FRAMES[0].depth_mm, depth_mm)
+    panorama = PanoramicFrame.of(0, {i: frame_of(i, depth_mm=flat) for i in poses})
+
+    def shown() -> int:
+        """How many pixels."""
+        depth_m = fused(panorama, calibration_of(poses), settings).panorama_depth_m
+        return int(np.count_nonzero(np.isfinite(depth_m)))
+
+    got = shown()
+    monkeypatch.setattr("rig_calib.fusion.ray_tables._window", lambda *_: (0, settings.circle_px))
+    expected = shown()
+    assert expected > 5_000
+    # A window begins elsewhere: in single precision a point beside the border of a pixel may change sides.
+    assert got == pytest.approx(expected, rel=0.003)
+
+
+def test_an_open_panorama_reaches_the_borders_of_small_images_too() -> None:
+    with LiveFusion(calibration_of({0: POSES[0]}), MODELS, SETTINGS) as fusion:
+        shown_rad = fusion.cylinder.width / fusion.cylinder.pixels_per_rad
+    assert shown_rad >= 2 * np.arctan((CAMERA.height - 1) / 2 / CAMERA.fy)  # it lies on its side
+
+
+def test_a_row_looks_wherever_a_partner_may_see_what_it_measures() -> None:
+    """Whatever the cameras' places, also where one looks across another's view between near and far."""
+    poses = {
+        0: looking((-3.0, 0.0, 0.0), 0),
+        1: looking((0.0, -1.0, 0.0), 90),
+        2: looking((2.0, 2.0, 0.5), -140),
+    }
+    grids = [PlacedGrid.of(MODEL, "color", T, None) for T in poses.values()]
+    ring, generator = ring_tables(grids), np.random.default_rng(3)
+    pixels = generator.integers((0, 0), (CAMERA.width, CAMERA.height), (20_000, 2))
+    depths_m = generator.uniform(0.4, 8.0, len(pixels))
+    for i, grid in enumerate(grids):
+        rays = grid.rays()[pixels[:, 1], pixels[:, 0]]
+        points = transform_points(grid.T_rig_grid, rays * depths_m[:, None])
+        for j in set(range(len(grids))) - {i}:
+            x, y, z = transform_points(inverse(grids[j].T_rig_grid), points).T
+            u, v = CAMERA.fx * x / z + CAMERA.cx, CAMERA.fy * y / z + CAMERA.cy
+            seen = (z > 0.1) & (u > 0) & (u < CAMERA.width - 1) & (v > 0) & (v < CAMERA.height - 1)
+            assert seen.any() == (j in ring.partners[i])
+            [k] = np.flatnonzero(ring.partners[i] == j)
+            first, last = ring.spans[i, k, pixels[seen, 1]].T
+            assert np.all((first <= pixels[seen, 0]) & (pixels[seen, 0] < last))
+
+
+def test_a_camera_whose_model_lacks_its_depth_camera_is_left_out_with_a_word(whole: FusedFrame) -> None:
+    camera, T_color_depth = replace(CAMERA, fx=130.0), np.eye(4)
+    full = replace(MODEL, depth=camera, T_color_depth=T_color_depth)
+    settings = replace(SETTINGS, depth_frame="depth")
+    panorama = with_frames({i: frame_of(i, depth_frame="depth") for i in POSES})
+    with LiveFusion(CALIBRATION, {**dict.fromkeys(POSES, full), 4: MODEL}, settings) as fusion:
+        frame = fusion.fuse(panorama)
+    assert 4 not in frame.camera_ids
+    assert len(frame.points_m) > 0.8 * len(whole.points_m)
+    [told] = frame.skipped
+    assert told.startswith("camera 4: left out, depth in the depth camera needs")
+    with pytest.raises(DataError, match="camera 0: left out, depth in the depth camera needs"):
+        LiveFusion(CALIBRATION, MODELS, settings)
+
+
+def test_a_frame_that_fails_is_no_hindrance_to_the_next(
+    whole: FusedFrame, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with LiveFusion(CALIBRATION, MODELS, replace(SETTINGS, threads=1)) as fusion:
+        with monkeypatch.context() as patched:
+            patched.setattr("rig_calib.fusion.live.pack_colors", Mock(side_effect=MemoryError))
+            with pytest.raises(MemoryError):
+                fusion.fuse(PANORAMA)
+        np.testing.assert_array_equal(fusion.fuse(PANORAMA).panorama, whole.panorama)
