@@ -11,6 +11,7 @@ if TYPE_CHECKING:  # heavy: imported where they are used, so that --help is quic
     from rich.console import Console
 
     from rig_calib.fusion.gains import Gain
+    from rig_calib.offline.capture import Capture
     from rig_calib.rig_calibration import RigCalibration
 
 Folder = Annotated[
@@ -56,54 +57,57 @@ def fuse(
     frames: Frames = None,
     mesh: Annotated[bool, typer.Option("--mesh", help="Write mesh.ply and mesh.glb, too.")] = False,
     voxel_mm: Annotated[float, typer.Option(min=2, max=100, help="Of the mesh: how fine it is.")] = 10.0,
-    workers: WorkerCount = None,
-    scheduler: Scheduler = None,
+    workers: Annotated[
+        int | None,
+        typer.Option(min=1, max=256, help="Of the mesh: processes of this machine; else one a core."),
+    ] = None,
+    scheduler: Annotated[
+        str | None,
+        typer.Option(metavar="ADDRESS", help="Of the mesh: work on the Dask cluster there instead."),
+    ] = None,
 ) -> None:
     """Fuse a rig folder or a recording with a calibration into cloud.ply and panorama.png."""
     from rich.console import Console
 
+    from rig_calib.offline.capture import open_capture
     from rig_calib.outputs import make_output_folder, write_fused
     from rig_calib.recorded_calibration import calibration_for
-    from rig_calib.rig_folder_calibration import read_description, read_views
+    from rig_calib.rig_folder_calibration import read_description, read_panoramas
     from rig_calib.tsdf.mesh_files import require_libraries
+    from rig_calib.view import views_from_panoramas
 
     if mesh:
         require_libraries()
     known = calibration_for(folder, calibration)
-    views = read_views(folder, read_description(folder), frames)
+    description = read_description(folder)
+    panoramas = list(read_panoramas(folder, description, frames))
     make_output_folder(out)
-    fused = write_fused(out, known, views)
+    fused = write_fused(out, known, views_from_panoramas(description, panoramas))
     console = Console(highlight=False)
     console.print(f"{len(fused.cloud):,} points in {out / 'cloud.ply'}")
     for why in fused.cloud.skipped:
         console.print(why, style="yellow")
     if mesh:
-        _fuse_mesh(console, folder, known, fused.gains, out, frames, voxel_mm * 1e-3, workers, scheduler)
+        capture = open_capture(folder).only(one.index for one in panoramas)
+        _fuse_mesh(console, capture, known, fused.gains, out, voxel_mm * 1e-3, (workers, scheduler))
 
 
 def _fuse_mesh(
     console: "Console",
-    path: Path,
+    capture: "Capture",
     known: "RigCalibration",
     gains: "Mapping[int, Gain]",
     out: Path,
-    frames: int | None,
     voxel_m: float,
-    workers: int | None,
-    scheduler: str | None,
+    workers: tuple[int | None, str | None],
 ) -> None:
-    from rig_calib.offline.capture import open_capture
     from rig_calib.offline.workers import open_workers
     from rig_calib.outputs import MESH_GLB, MESH_PLY, write_mesh
     from rig_calib.terminal import progress_bar
-    from rig_calib.tsdf.fusing import first_positions, fuse_capture
+    from rig_calib.tsdf.fusing import fuse_capture
 
-    capture = open_capture(path)
-    positions = first_positions(capture, frames)
-    with progress_bar(console) as tell, open_workers(workers, scheduler) as hands:
-        volume = fuse_capture(
-            capture, positions, known, gains, voxel_m, hands, lambda share: tell("mesh", share)
-        )
+    with progress_bar(console) as tell, open_workers(*workers) as hands:
+        volume = fuse_capture(capture, known, gains, voxel_m, hands, lambda share: tell("mesh", share))
     made = write_mesh(out, volume, known)
     rims, length_m = made.holes()
     console.print(

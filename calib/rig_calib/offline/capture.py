@@ -2,7 +2,7 @@
 
 import logging
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from rig_calib.recorded_calibration import recorded_calibration
@@ -50,6 +50,11 @@ class Capture:
     calibration: RigCalibration | None = None
     recording: Recording | None = None
     grouped: tuple[RecordedSet, ...] = ()
+
+    def only(self, indices: Iterable[int]) -> "Capture":
+        """The same, of which nothing but the panoramic frames with these indices is known."""
+        wanted = set(indices)
+        return replace(self, marks=tuple(mark for mark in self.marks if mark.index in wanted))
 
     def read(self, positions: range) -> Iterator[PanoramicFrame]:
         """The panoramic frames there, complete or not, one by one; one without any image is left out.

@@ -9,10 +9,7 @@ from rig_calib.fusion.gains import Gain
 from rig_calib.fusion.voxels import Keys
 from rig_calib.offline.capture import Capture
 from rig_calib.offline.workers import Batch, Tell, Workers, batches_of
-from rig_calib.recorded_panoramas import DEFAULT_FRAMES as TAKE_FRAMES
-from rig_calib.recorded_panoramas import is_recording
 from rig_calib.rig_calibration import RigCalibration
-from rig_calib.rig_folder_calibration import MAX_FRAMES as FOLDER_FRAMES
 from rig_calib.tsdf.range_image import RangeImage, range_images
 from rig_calib.tsdf.volume import MAX_FRAMES, MAX_VOXEL_M, MIN_VOXEL_M, Volume, blocks_near, check_size
 from rig_calib.view import CameraView, views_from_panoramas
@@ -22,29 +19,22 @@ FRAMES_A_BATCH = 10
 """Averaged before they are cleaned: what flickers shows."""
 
 
-def first_positions(capture: Capture, frames: int | None) -> range:
-    """Positions of the first `frames` panoramic frames, by default as many as `read_panoramas` takes."""
-    usual = TAKE_FRAMES if is_recording(capture.path) else FOLDER_FRAMES
-    return range(min(frames or usual, len(capture.marks)))
-
-
 def fuse_capture(
     capture: Capture,
-    positions: range,
     calibration: RigCalibration,
     gains: Mapping[int, Gain],
     voxel_m: float,
     workers: Workers,
     tell: Tell = lambda _share: None,
 ) -> Volume:
-    """What the cameras measured in the frames at `positions`, of a scene that was still.
+    """What the cameras measured in all frames of a capture, of a scene that was still.
 
     Where there is more than one batch, a first pass over them finds the blocks, so that every image speaks
     of all that it sees through, whenever it was taken. DataError when no camera measured anything,
     ConfigurationError for a voxel that is too small for this scene.
     """
-    _check(voxel_m, len(positions))
-    batches = batches_of(capture, positions, FRAMES_A_BATCH)
+    _check(voxel_m, len(capture.marks))
+    batches = batches_of(capture, range(len(capture.marks)), FRAMES_A_BATCH)
     keys, first = None, 0.0
     if len(batches) > 1:
         first, keys = 0.5, np.empty(0, np.int64)

@@ -14,10 +14,10 @@ from rig_calib.cli import main
 from rig_calib.offline.capture import open_capture
 from rig_calib.offline.workers import Batch, Result, Tell, ThisProcess
 from rig_calib.tsdf import fusing
-from rig_calib.tsdf.fusing import first_positions, fuse_capture
+from rig_calib.tsdf.fusing import fuse_capture
 from rig_calib.tsdf.volume import Volume
 from rig_protocol.errors import ConfigurationError, DataError
-from rig_protocol.frames import RgbdFrame
+from rig_protocol.frames import PanoramicFrame, RgbdFrame
 from rig_protocol.rig_folder import CameraEntry, RigDescription, RingDrawing, write_rig_folder
 from support.box_room import MODEL, BoxRoom, calibration_of, ring_poses
 from support.box_takes import box_calibration, box_description, box_panorama, write_take
@@ -64,7 +64,7 @@ class Elsewhere(ThisProcess):
 def fused(folder: Path, workers: ThisProcess, told: list[float] | None = None) -> Volume:
     capture = open_capture(folder)
     tell = (lambda _share: None) if told is None else told.append
-    return fuse_capture(capture, first_positions(capture, None), CALIBRATION, {}, VOXEL_M, workers, tell)
+    return fuse_capture(capture, CALIBRATION, {}, VOXEL_M, workers, tell)
 
 
 def run(monkeypatch: pytest.MonkeyPatch, *words: object) -> int:
@@ -128,6 +128,18 @@ def test_a_take_gives_a_mesh_by_the_calibration_that_it_carries(
     assert np.median(np.abs(mesh.visual.vertex_colors[:, :3] - expected)) < 2
 
 
+def test_a_mesh_is_made_of_the_frames_of_its_cloud(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of a take whose cameras came one by one that are the complete ones, not the first."""
+    first = [PanoramicFrame.of(k, {0: box_panorama(k).frames[0], 1: None, 2: None}) for k in range(6)]
+    sets = [*first, box_panorama(6), box_panorama(7)]
+    take = write_take(tmp_path / "take.mcap", box_description(), sets, box_calibration())
+    words = ("--out", tmp_path, "--mesh", "--workers", 1, "--frames", 2, "--voxel-mm", 30)
+    assert run(monkeypatch, "fuse", take, *words) == 0
+    mesh = trimesh.load_mesh(tmp_path / "mesh.ply", process=False)
+    cloud = trimesh.load(tmp_path / "cloud.ply").vertices
+    np.testing.assert_allclose(mesh.bounds, [cloud.min(axis=0), cloud.max(axis=0)], atol=0.1)
+
+
 def test_without_mesh_none_is_written(folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     words = ("--calibration", folder / "calibration.json", "--out", tmp_path)
     assert run(monkeypatch, "fuse", folder, *words) == 0
@@ -161,11 +173,11 @@ def test_cameras_without_a_pose_make_no_surface(folder: Path) -> None:
     capture = open_capture(folder)
     nobody = replace(CALIBRATION, cameras=())
     with pytest.raises(DataError, match="no camera that has a pose"):
-        fuse_capture(capture, range(1), nobody, {}, VOXEL_M, ThisProcess())
+        fuse_capture(capture, nobody, {}, VOXEL_M, ThisProcess())
 
 
 @pytest.mark.parametrize("voxel_m", [0.0, -0.01, 0.0005, 5.0, float("nan")])
 def test_a_voxel_out_of_reason_is_refused(folder: Path, voxel_m: float) -> None:
     capture = open_capture(folder)
     with pytest.raises(ConfigurationError, match="take 2 to 100 mm"):
-        fuse_capture(capture, range(1), CALIBRATION, {}, voxel_m, ThisProcess())
+        fuse_capture(capture, CALIBRATION, {}, voxel_m, ThisProcess())
