@@ -32,6 +32,8 @@ def whole_folder(path: Path) -> Iterator[Path]:
 
 
 def refuse_existing(path: Path) -> None:
-    """ConfigurationError where there is a file, or a folder that is not empty."""
+    """ConfigurationError where there is a file, or a folder that is not empty, or one without a name."""
+    if not path.name:
+        raise ConfigurationError(f"{path} has no name: name what is to be made with --out")
     if path.is_file() or (path.is_dir() and any(path.iterdir())):
         raise ConfigurationError(f"{path} exists and stays as it is: name another with --out, or remove it")

@@ -1,6 +1,6 @@
 """Takes and rig folders of the box room: small cameras, colour and disparity known in closed form."""
 
-from collections.abc import Iterable
+from collections.abc import Container, Iterable
 from dataclasses import replace
 from pathlib import Path
 
@@ -64,8 +64,9 @@ def write_take(
     panoramas: Iterable[PanoramicFrame],
     calibration: RigCalibration | None = None,
     created: str = CREATED,
+    broken: Container[int] = (),
 ) -> Path:
-    """A recording of these panoramic frames, bit for bit."""
+    """A recording of these panoramic frames, bit for bit; those with a `broken` index do not decode."""
     with path.open("wb") as output:
         writer = RecordingWriter(output, created, CREATED_NS)
         writer.attach(DESCRIPTION, description.to_dict(), 0)
@@ -74,7 +75,8 @@ def write_take(
         for panorama in panoramas:
             for frame in panorama.frames.values():
                 if frame is not None:
-                    writer.write(_encoded(frame))
+                    encoded = _encoded(frame)
+                    writer.write(_broken(encoded) if panorama.index in broken else encoded)
             stamps = {i: None if one is None else one.timestamp_ns for i, one in panorama.frames.items()}
             writer.write(RecordedSet(panorama.index, panorama.timestamp_ns, stamps))
         writer.finish()
@@ -150,6 +152,16 @@ def _encoded(frame: RgbdFrame) -> EncodedFrame:
         frame.damaged,
         gravity=frame.gravity,
     )
+
+
+def _broken(frame: EncodedFrame) -> EncodedFrame:
+    """The same, of which no image can be read."""
+    payloads = {
+        name: replace(payload, data=b"no image")
+        for name in ("color", "depth")
+        if (payload := getattr(frame, name)) is not None
+    }
+    return replace(frame, **payloads)
 
 
 def damaged(frame: RgbdFrame) -> RgbdFrame:

@@ -4,12 +4,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 import OpenEXR
 
 from rig_calib.frame_exports.frame_files import Scene, export_scenes
 from rig_calib.frame_exports.job import Exported, ExportJob
 from rig_calib.frame_exports.panorama_geometry import panorama_geometry
+from rig_calib.fusion.linear_light import LINEAR_LIGHT
 from rig_calib.whole_file import whole_file
 
 
@@ -18,13 +18,7 @@ def export(job: ExportJob) -> Exported:
     return export_scenes(job, "panorama", ".exr", _write)
 
 
-def _linear_light() -> npt.NDArray[np.float16]:
-    """What OpenEXR holds of the 256 values of a camera, which are sRGB's (IEC 61966-2-1); all differ."""
-    value = np.arange(256) / 255
-    return np.where(value <= 0.04045, value / 12.92, ((value + 0.055) / 1.055) ** 2.4).astype(np.float16)
-
-
-_LINEAR_LIGHT = _linear_light()
+_LINEAR_LIGHT = LINEAR_LIGHT.astype(np.float16)  # all differ
 
 
 def _write(path: Path, scene: Scene) -> None:

@@ -70,6 +70,7 @@ def export(job: ExportJob) -> Exported:
                 written[shown.camera_id] += 1
             for topic, time_ns, message in _messages(frame, cameras, stamps):
                 writer.write_message(topic, message, stamps.ns(frame.timestamp_ns), stamps.ns(time_ns))
+        job.refuse_nothing(sum(written.values()))
     names = [camera.name for camera in cameras]
     missing = missing_notes(names, list(written.values()), len(job.positions))
     return Exported((job.out,), (*unplaced_notes(job, cameras), *missing, *stamps.notes))

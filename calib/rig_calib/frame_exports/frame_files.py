@@ -46,16 +46,17 @@ class _Writer:
     settings: LiveFusionSettings
     utc_minus_rig_ns: int | None
 
-    def __call__(self, batch: Batch) -> Counter[str]:
-        """Write its files; what was left out, and of how many frames."""
-        skipped: Counter[str] = Counter()
+    def __call__(self, batch: Batch) -> tuple[int, Counter[str]]:
+        """Write its files; how many frames that were, and what was left out of how many."""
+        written, skipped = 0, Counter[str]()
         with borrowed_fusion(batch.capture, self.calibration, self.settings) as fusion:
             for panorama in batch.panoramas():
                 fused = fusion.fuse(panorama)
                 scene = Scene(fused, fusion, self.calibration, self._utc_ns(fused.timestamp_ns))
                 self.write(self.path_of(panorama.index), scene)
                 skipped.update(fused.skipped)
-        return skipped
+                written += 1
+        return written, skipped
 
     def _utc_ns(self, rig_time_ns: int) -> int | None:
         ahead_ns = self.utc_minus_rig_ns
@@ -97,9 +98,11 @@ def notes_of(job: ExportJob, skipped: Counter[str]) -> tuple[str, ...]:
 def _write_scenes(job: ExportJob, write: WriteScene, path_of: Callable[[int], Path]) -> tuple[str, ...]:
     calibration, settings = job.needed_calibration(), settings_of(job)
     writer = _Writer(write, path_of, calibration, settings, TimeStamps.of(job.capture).utc_minus_rig_ns)
-    skipped: Counter[str] = Counter()
-    for own in job.workers.map(writer, batches_of(job.capture, job.positions, BATCH_FRAMES), job.tell):
+    written, skipped = 0, Counter[str]()
+    for count, own in job.workers.map(writer, batches_of(job.capture, job.positions, BATCH_FRAMES), job.tell):
+        written += count
         skipped.update(own)
+    job.refuse_nothing(written)
     return notes_of(job, skipped)
 
 

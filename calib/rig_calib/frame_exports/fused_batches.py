@@ -16,11 +16,12 @@ from rig_calib.fusion.live import FusedFrame, LiveFusion, LiveFusionSettings
 from rig_calib.offline.capture import Capture
 from rig_calib.offline.workers import Batch
 from rig_calib.rig_calibration import RigCalibration
-from rig_protocol.frames import PanoramicFrame
+from rig_protocol.frames import PanoramicFrame, RgbdFrame
 
 # Idle fusions of this process, all of one content: their tables take a second and some 20 MB a Kinect.
 _idle: list[tuple[str, LiveFusion]] = []
 _idle_lock = Lock()
+_LOOKED_AT = 60  # frames, where cameras join one by one
 os.register_at_fork(after_in_child=_idle.clear)  # their threads stay behind in the parent
 
 
@@ -66,9 +67,26 @@ def settings_of(job: ExportJob) -> LiveFusionSettings:
     settings = replace(usual_settings(job.capture), centre_m=job.look.centre_m)
     if not job.look.match_colors:
         return settings
-    first = next(job.capture.read(job.positions[:1]), None)
-    gains = {} if first is None else frame_gains(job.capture.description, first, job.needed_calibration())
+    chosen = _fullest(job)
+    gains = {} if chosen is None else frame_gains(job.capture.description, chosen, job.needed_calibration())
     return replace(settings, gains=gains)
+
+
+def _fullest(job: ExportJob) -> PanoramicFrame | None:
+    """The first panoramic frame of a job's first seconds that no other has more cameras than."""
+    placed = job.needed_calibration().poses.keys() & set(job.capture.description.camera_ids)
+    fullest, most = None, 0
+    for panorama in job.capture.read(job.positions[:_LOOKED_AT]):
+        count = sum(_whole(panorama.frames.get(camera_id)) for camera_id in placed)
+        if count > most:
+            fullest, most = panorama, count
+        if most == len(placed):
+            break
+    return fullest
+
+
+def _whole(frame: RgbdFrame | None) -> bool:
+    return frame is not None and not frame.damaged
 
 
 def usual_settings(capture: Capture) -> LiveFusionSettings:

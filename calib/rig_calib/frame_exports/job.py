@@ -7,14 +7,14 @@ from pathlib import Path
 from rig_calib.offline.capture import Capture
 from rig_calib.offline.workers import Tell, Workers
 from rig_calib.rig_calibration import RigCalibration
-from rig_protocol.errors import ConfigurationError
+from rig_protocol.errors import ConfigurationError, DataError
 
 
 @dataclass(frozen=True, slots=True)
 class FusionLook:
     """How fused frames shall look: seen from `centre_m` in the rig frame, by default amid the cameras.
 
-    `match_colors`: cameras of different exposure are made to agree, by the job's first frame.
+    `match_colors`: cameras of different exposure are made to agree, by the first frame that all are in.
     """
 
     centre_m: tuple[float, float, float] | None = None
@@ -36,6 +36,14 @@ class ExportJob:
     fps: float = 30.0
     look: FusionLook = FusionLook()  # frozen
     tell: Tell = field(default=lambda _share: None)
+
+    def refuse_nothing(self, written: int) -> None:
+        """DataError where none of the frames held an image: rather no output than an empty one."""
+        if not written:
+            raise DataError(
+                f"{self.capture.path}: none of the {len(self.positions)} panoramic frames that were asked "
+                "for holds an image that can be read: choose others with --first"
+            )
 
     def needed_calibration(self) -> RigCalibration:
         """The calibration; ConfigurationError where there is none."""

@@ -54,6 +54,7 @@ def export(job: ExportJob) -> Exported:
             for shown in frame.cameras:
                 written[shown.camera_id] += 1
             log.frame(frame, cameras)
+        job.refuse_nothing(sum(written.values()))
     names = [camera.name for camera in cameras]
     missing = missing_notes(names, list(written.values()), len(job.positions))
     return Exported((job.out,), (*unplaced_notes(job, cameras), *missing, *stamps.notes))

@@ -42,6 +42,7 @@ def export(job: ExportJob) -> Exported:
                 directory = folder / description.camera(files.camera_id).name
                 for name, data in files.images.items():
                     (directory / name).write_bytes(data)
+        job.refuse_nothing(sum(written.values()))
         write_rig_description(folder, with_gravity(description, felt))
     names = [camera.name for camera in description.cameras]
     return Exported((job.out,), tuple(missing_notes(names, list(written.values()), len(job.positions))))

@@ -76,9 +76,10 @@ def export(job: ExportJob) -> Exported:
         for pairs in job.workers.map(partial(_pairs, cameras=cameras), batches, job.tell):
             for pair in pairs:
                 sequences[pair.camera_id].write(pair, stamps)
+        written = [len(sequence.colors) for sequence in sequences.values()]
+        job.refuse_nothing(sum(written))
         for sequence in sequences.values():
             sequence.finish()
-    written = [len(sequence.colors) for sequence in sequences.values()]
     missing = missing_notes([camera.name for camera in cameras], written, len(job.positions))
     return Exported((job.out,), (*unplaced_notes(job, cameras), *missing, *stamps.notes))
 

@@ -94,6 +94,8 @@ def _encode(file: BinaryIO, codec: _Codec, job: ExportJob, drawn: Iterator[_Draw
     with av.open(file, "w", format=codec.container) as container:
         stream: VideoStream | None = None
         for batch in drawn:
+            if not batch.images:
+                continue
             stream = stream or _stream(container, codec, job, batch)
             for image, timestamp_ns in zip(batch.images, batch.timestamps_ns, strict=True):
                 frame = _frame(image, codec)
@@ -102,6 +104,7 @@ def _encode(file: BinaryIO, codec: _Codec, job: ExportJob, drawn: Iterator[_Draw
             skipped.update(batch.skipped)
         if stream is not None:
             container.mux(stream.encode(None))
+    job.refuse_nothing(clock.count)
     return skipped
 
 
@@ -146,13 +149,14 @@ class _Clock:
 
     def __init__(self, fps: float | None) -> None:
         self._fps = fps
-        self._count, self._begin_ns, self._last = 0, 0, -1
+        self.count = 0
+        self._begin_ns, self._last = 0, -1
 
     def ticks(self, timestamp_ns: int) -> int:
         """Those of the next frame."""
-        if self._count == 0:
+        if self.count == 0:
             self._begin_ns = timestamp_ns
-        seconds = (timestamp_ns - self._begin_ns) * 1e-9 if self._fps is None else self._count / self._fps
+        seconds = (timestamp_ns - self._begin_ns) * 1e-9 if self._fps is None else self.count / self._fps
         self._last = max(self._last + 1, round(seconds * _TICKS))
-        self._count += 1
+        self.count += 1
         return self._last

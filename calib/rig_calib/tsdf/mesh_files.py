@@ -6,7 +6,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from rig_calib.tsdf.mesh import Array, Mesh
+from rig_calib.fusion.linear_light import LINEAR_LIGHT
+from rig_calib.tsdf.mesh import Mesh
 from rig_calib.whole_file import whole_file
 from rig_protocol.errors import ConfigurationError
 from rig_protocol.frames import ImageU8
@@ -75,10 +76,7 @@ def _write(path: Path, written: bytes) -> None:
 
 
 def _linear(colors: ImageU8) -> ImageU8:
-    """sRGB (IEC 61966-2-1) to linear light."""
-    values: Array = np.arange(256) / 255
-    linear = np.where(values <= 0.04045, values / 12.92, ((values + 0.055) / 1.055) ** 2.4)
-    return np.asarray(np.rint(255 * linear).astype(np.uint8)[colors])
+    return np.asarray(np.rint(255 * LINEAR_LIGHT).astype(np.uint8)[colors])
 
 
 def _make_unlit(tree: dict[str, Any]) -> None:

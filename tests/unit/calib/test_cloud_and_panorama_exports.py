@@ -19,7 +19,7 @@ import pye57
 import pytest
 from pypcd4 import PointCloud
 
-from rig_calib.frame_exports import frame_files, ply, video
+from rig_calib.frame_exports import frame_files, fused_batches, ply, video
 from rig_calib.frame_exports.formats import FORMATS
 from rig_calib.frame_exports.fused_batches import borrowed_fusion, fused_batch
 from rig_calib.frame_exports.job import ExportJob
@@ -254,7 +254,7 @@ def test_an_mp4_video_is_h264_of_even_size_close_to_the_panoramas(
 ) -> None:
     # A circle that fits the small cameras of the test: on a finer one their pixels would stand apart.
     coarse = LiveFusionSettings(circle_px=705)
-    monkeypatch.setattr(video, "usual_settings", lambda _capture: coarse)
+    monkeypatch.setattr(fused_batches, "usual_settings", lambda _capture: coarse)
     job = export_job(take, tmp_path / "hall.mp4")
     video.export(job)
     seconds, images, metadata, codec = decoded(tmp_path / "hall.mp4")
@@ -280,6 +280,16 @@ def test_the_frames_of_a_rig_folder_come_at_the_given_rate(tmp_path: Path) -> No
     job = replace(export_job(folder, tmp_path / "room.mkv", box_calibration()), fps=10.0)
     FORMATS["video"].exporter()(job)
     assert decoded(tmp_path / "room.mkv")[0] == pytest.approx([0.0, 0.1, 0.2])
+
+
+def test_a_video_begins_with_the_first_frame_that_can_be_read(tmp_path: Path) -> None:
+    """However many come before it: here all that are drawn together."""
+    panoramas, broken = [box_panorama(k) for k in range(6)], range(5)
+    source = write_take(
+        tmp_path / "take.mcap", box_description(), panoramas, box_calibration(), broken=broken
+    )
+    video.export(export_job(source, tmp_path / "hall.mkv"))
+    assert len(decoded(tmp_path / "hall.mkv")[1]) == 1
 
 
 def test_another_ending_of_a_video_is_refused(take: Path, tmp_path: Path) -> None:

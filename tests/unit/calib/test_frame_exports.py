@@ -12,6 +12,7 @@ from rig_calib.frame_exports.formats import FORMATS
 from rig_calib.frame_exports.job import Exported, ExportJob
 from rig_calib.offline.workers import Batch, Tell
 from rig_calib.rig_calibration import RigCalibration
+from rig_calib.whole_folder import refuse_existing
 from rig_protocol.errors import ConfigurationError, DataError, RigError
 from rig_protocol.frames import PanoramicFrame
 from rig_protocol.recording import recover
@@ -127,6 +128,20 @@ def test_missing_and_damaged_frames_are_left_out_and_counted(form: str, take: Pa
         "cam01: 1 of 5 frames are missing or damaged, and left out",
         "cam02: 1 of 5 frames are missing or damaged, and left out",
     ]
+
+
+@pytest.mark.parametrize("form", FORMATS)
+def test_where_no_image_can_be_read_nothing_is_written_and_that_is_told(form: str, tmp_path: Path) -> None:
+    source = write_take(tmp_path / "take.mcap", box_description(), [box_panorama(0)], broken={0})
+    with pytest.raises(DataError, match=r"none of the 1 panoramic frames .* holds an image"):
+        export(form, job_of(source, form, tmp_path))
+    assert list(tmp_path.iterdir()) == [source]
+
+
+@pytest.mark.parametrize("out", [Path(), Path("/")])
+def test_a_place_without_a_name_is_refused(out: Path) -> None:
+    with pytest.raises(ConfigurationError, match="has no name"):
+        refuse_existing(out)
 
 
 def test_a_take_without_a_date_is_stamped_in_rig_time_and_says_so(tmp_path: Path) -> None:

@@ -82,6 +82,16 @@ def test_cameras_of_different_exposure_are_matched_where_a_job_asks_for_it(tmp_p
         np.testing.assert_allclose(gains[1] / gains[neighbour], 2.0, rtol=0.1)
 
 
+def test_cameras_that_come_later_are_matched_too(tmp_path: Path) -> None:
+    path = write_room_capture(tmp_path / "dark", 2, exposures={1: 0.5})
+    for image in (path / "cam01").glob("*_000.png"):
+        image.unlink()
+    job = ExportJob(open_capture(path), range(2), tmp_path, ThisProcess(), CALIBRATION)
+    gains = settings_of(replace(job, look=FusionLook(match_colors=True))).gains
+    assert gains.keys() == {0, 1, 2}
+    np.testing.assert_allclose(gains[1] / gains[0], 2.0, rtol=0.1)
+
+
 def test_a_jobs_panorama_is_seen_from_where_it_says(capture: Capture, tmp_path: Path) -> None:
     job = ExportJob(capture, range(1), tmp_path, ThisProcess(), CALIBRATION, look=FusionLook((0.5, 0.0, 0.2)))
     with borrowed_fusion(capture, CALIBRATION, settings_of(job)) as fusion:
