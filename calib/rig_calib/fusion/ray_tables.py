@@ -105,25 +105,14 @@ class PlacedGrid:
         turned = self.rays()[np.ix_(rows, columns)] @ self.T_rig_grid[:3, :3].T
         return np.asarray(ranges_m[:, None, None, None] * turned + self.T_rig_grid[:3, 3])
 
-    def sees_along(self, near: Array, far: Array) -> npt.NDArray[np.bool_]:
-        """Which lines (...) from near to far points (..., 3) of the rig frame pass its view, or nearly."""
-        sides = self._sides() @ self.T_rig_grid[:3, :3].T
-        begin, end = ((points - self.T_rig_grid[:3, 3]) @ sides.T for points in (near, far))
-        with np.errstate(divide="ignore", invalid="ignore"):  # of lines along a side
-            crossing = begin / (begin - end)
-        enters = np.where(begin >= 0, 0.0, np.where(end >= 0, crossing, np.inf)).max(axis=-1)
-        leaves = np.where(end >= 0, 1.0, np.where(begin >= 0, crossing, -np.inf)).min(axis=-1)
-        return np.asarray((enters <= leaves) & np.isfinite(begin + end).all(axis=-1))
-
-    def _sides(self) -> Array:
-        """Inward normals (4,3), in its own frame, of the planes around its view, some pixels wider."""
+    def sides(self) -> Array:
+        """Planes (4,4) of the rig frame around its view, some pixels wider: inward normals, and distances."""
         rays, lens = pixel_rays(self.grid.intrinsics), self.grid.intrinsics
         margin = _BLOCK_PX / np.array([lens.fx, lens.fy])
-        (left, top), (right, bottom) = (
-            np.nanmin(rays, axis=(0, 1)) - margin,
-            np.nanmax(rays, axis=(0, 1)) + margin,
-        )
-        return np.array([[1.0, 0.0, -left], [-1.0, 0.0, right], [0.0, 1.0, -top], [0.0, -1.0, bottom]])
+        left, top = np.nanmin(rays, axis=(0, 1)) - margin
+        right, bottom = np.nanmax(rays, axis=(0, 1)) + margin
+        normals = [[1.0, 0.0, -left], [-1.0, 0.0, right], [0.0, 1.0, -top], [0.0, -1.0, bottom]]
+        return np.asarray(np.array(normals) @ inverse(self.T_rig_grid)[:3])
 
 
 def ring_tables(grids: Sequence[PlacedGrid]) -> Ring:
@@ -226,9 +215,10 @@ def _shared_views(grids: Sequence[PlacedGrid]) -> tuple[npt.NDArray[np.int64], n
     partners = np.full((len(grids), MAX_PARTNERS), -1, np.int64)
     spans = np.zeros((len(grids), MAX_PARTNERS, grids[0].shape[0], 2), np.int64)
     rows, columns = (-(-size // _BLOCK_PX) for size in grids[0].shape)
+    sides = [grid.sides() for grid in grids]
     for i, grid in enumerate(grids):
         near, far = grid.points(_RANGE_M, _BLOCK_PX)[:, :rows, :columns]
-        masks = {j: other.sees_along(near, far) for j, other in enumerate(grids) if j != i}
+        masks = {j: _passes(near, far, sides[j]) for j in range(len(grids)) if j != i}
         by_share = sorted(
             (j for j in masks if masks[j].any()), key=lambda j: (-np.count_nonzero(masks[j]), j)
         )
@@ -236,6 +226,16 @@ def _shared_views(grids: Sequence[PlacedGrid]) -> tuple[npt.NDArray[np.int64], n
             partners[i, k] = j
             spans[i, k] = _spans(masks[j], grid.shape)
     return partners, spans
+
+
+def _passes(near: Array, far: Array, sides: Array) -> npt.NDArray[np.bool_]:
+    """Which lines (...) from near to far points (..., 3) have a part within all planes (n, 4)."""
+    begin, end = (points @ sides[:, :3].T + sides[:, 3] for points in (near, far))
+    with np.errstate(divide="ignore", invalid="ignore"):  # of lines along a plane
+        crossing = begin / (begin - end)
+    enters = np.where(begin >= 0, 0.0, np.where(end >= 0, crossing, np.inf)).max(axis=-1)
+    leaves = np.where(end >= 0, 1.0, np.where(begin >= 0, crossing, -np.inf)).min(axis=-1)
+    return np.asarray((enters <= leaves) & np.isfinite(begin + end).all(axis=-1))
 
 
 def _spans(blocks: npt.NDArray[np.bool_], shape: tuple[int, int]) -> npt.NDArray[np.int64]:
