@@ -45,11 +45,16 @@ class ExportedRig:
 
     def ros_names(self) -> list[str]:
         """Names of the cameras as ROS allows them: letters, digits, underscores, each once."""
-        names: list[str] = []
-        for n, camera in enumerate(self.cameras):
-            name = re.sub(r"[^A-Za-z0-9_]", "_", camera.name)
-            names.append(name if name not in names else f"{name}_{n}")
-        return names
+        return ros_names([camera.name for camera in self.cameras])
+
+
+def ros_names(names: Sequence[str]) -> list[str]:
+    """The names as ROS allows them: letters, digits, underscores, each once."""
+    allowed: list[str] = []
+    for n, own in enumerate(names):
+        name = re.sub(r"[^A-Za-z0-9_]", "_", own)
+        allowed.append(name if name not in allowed else f"{name}_{n}")
+    return allowed
 
 
 @dataclass(frozen=True, slots=True)

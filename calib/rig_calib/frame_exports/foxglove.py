@@ -5,6 +5,7 @@ NAME_color_optical_frame -> NAME_depth_optical_frame.
 """
 
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -21,6 +22,7 @@ from foxglove_schemas_protobuf.Vector3_pb2 import Vector3
 from google.protobuf.timestamp_pb2 import Timestamp
 from mcap_protobuf.writer import Writer
 
+from rig_calib.exports.exported_rig import ros_names
 from rig_calib.exports.ros2 import COLOR_FRAME, DEPTH_FRAME, ROOT
 from rig_calib.exports.rotations import quaternion_wxyz
 from rig_calib.frame_exports.frame_files import make_folder_of
@@ -62,7 +64,9 @@ def export(job: ExportJob) -> Exported:
     """
     refuse_existing(job.out)
     make_folder_of(job.out)
-    cameras, stamps = placed_cameras(job), TimeStamps.of(job.capture)
+    placed, stamps = placed_cameras(job), TimeStamps.of(job.capture)
+    names = [camera.name for camera in placed]
+    cameras = [replace(camera, name=name) for camera, name in zip(placed, ros_names(names), strict=True)]
     written = dict.fromkeys((camera.id for camera in cameras), 0)
     with whole_file(job.out) as file, Writer(file) as writer:
         for frame in shown_frames(job, cameras):
@@ -71,7 +75,6 @@ def export(job: ExportJob) -> Exported:
             for topic, time_ns, message in _messages(frame, cameras, stamps):
                 writer.write_message(topic, message, stamps.ns(frame.timestamp_ns), stamps.ns(time_ns))
         job.refuse_nothing(sum(written.values()))
-    names = [camera.name for camera in cameras]
     missing = missing_notes(names, list(written.values()), len(job.positions))
     return Exported((job.out,), (*unplaced_notes(job, cameras), *missing, *stamps.notes))
 

@@ -1,6 +1,7 @@
 """Foxglove MCAP, read by the mcap library and by Rerun: topics, colours, units, directions, times."""
 
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -237,6 +238,19 @@ def test_registered_depth_stands_in_the_colour_frame(tmp_path: Path) -> None:
     assert first(told, "/cam00/depth").frame_id == "cam00_color_optical_frame"
     assert np.abs(depth_of(first(told, "/cam00/depth")).astype(int) - frames[0].depth_mm).max() <= 1
     assert len(first(told, "/tf").transforms) == 2
+
+
+def test_cameras_are_named_as_in_the_export_to_ros(tmp_path: Path) -> None:
+    names = ["left-1", "left 1", "cam02"]
+    cameras = tuple(
+        replace(entry, name=name) for entry, name in zip(box_description().cameras, names, strict=True)
+    )
+    take = write_take(tmp_path / "take.mcap", RigDescription(cameras), [box_panorama(0)], box_calibration())
+    foxglove.export(export_job(take, tmp_path / "view.mcap"))
+    told = messages_of(tmp_path / "view.mcap")
+    for name in ("left_1", "left_1_1", "cam02"):
+        assert first(told, f"/{name}/depth").frame_id == f"{name}_depth_optical_frame"
+        assert pose_of(told, f"{name}_color_optical_frame")[0] == "rig"
 
 
 def test_another_program_reads_the_same(view: Path, told: Told) -> None:
