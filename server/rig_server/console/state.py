@@ -100,7 +100,7 @@ def session_state(view: SessionView) -> dict[str, Any]:
         "pairs": [_pair(pair) for pair in view.pairs],
         "failures": list(view.failures),
         "missed": view.missed,
-        "moved": {str(camera): list(by) for camera, by in view.moved.items()},
+        "moved": {str(camera): list(map(plain, by)) for camera, by in view.moved.items()},
         "message": view.message,
     }
 
@@ -170,8 +170,8 @@ def _pair(pair: PairSupport) -> dict[str, Any]:
     return {
         "name": pair.name,
         "matches": pair.matches,
-        "deg": None if expected is None else round(expected.deg, 4),
-        "mm": None if expected is None else round(expected.mm, 2),
+        "deg": None if expected is None else plain(expected.deg),
+        "mm": None if expected is None else plain(expected.mm),
         "support": pair.support,
         "advice": pair.advice,
     }
