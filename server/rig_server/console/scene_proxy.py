@@ -9,7 +9,6 @@ from aiohttp import web
 from rig_server.console.scene import GUARD_HEADER
 
 PATH = "/scene"
-CLOSING_S = 1.0  # for a page's last word: one that sleeps has none, and must not hold up the end
 _MAX_FROM_PAGE = 1 << 20  # bytes of one message
 _MAX_FROM_SCENE = 64 << 20
 # viser's page is one file with its scripts in it, which make code and workers as they run.
@@ -67,9 +66,7 @@ class SceneProxy:
         async with session.ws_connect(
             self._base + "/", protocols=protocols, max_msg_size=_MAX_FROM_SCENE, compress=0
         ) as scene:
-            page = web.WebSocketResponse(
-                timeout=CLOSING_S, protocols=protocols, max_msg_size=_MAX_FROM_PAGE, compress=False
-            )
+            page = web.WebSocketResponse(protocols=protocols, max_msg_size=_MAX_FROM_PAGE, compress=False)
             await page.prepare(request)
             # Whoever is slow holds the other up: viser then leaves out what has become old.
             async with contextlib.AsyncExitStack() as at_the_end:

@@ -19,8 +19,8 @@ from rig_protocol.errors import ConfigurationError, RigError
 from rig_protocol.events import Address
 from rig_server.console.access import Gate
 from rig_server.console.camera_pictures import Mode
-from rig_server.console.scene_proxy import CLOSING_S, SceneProxy
 from rig_server.console.scene_proxy import PATH as SCENE_PATH
+from rig_server.console.scene_proxy import SceneProxy
 from rig_server.console.strangers import Doorkeeper
 from rig_server.console.tiles import Look, TileRound
 from rig_server.console.viewer import Viewer
@@ -248,9 +248,7 @@ class WebServer:
     async def _live(self, request: web.Request) -> web.StreamResponse:
         if len(self._viewers) >= _MAX_VIEWERS:
             raise web.HTTPServiceUnavailable(text=f"{_MAX_VIEWERS} pages look at this rig already")
-        wire = web.WebSocketResponse(
-            timeout=CLOSING_S, heartbeat=20.0, max_msg_size=_MAX_WORD_BYTES, compress=False
-        )
+        wire = web.WebSocketResponse(heartbeat=20.0, max_msg_size=_MAX_WORD_BYTES, compress=False)
         await wire.prepare(request)
         viewer = Viewer(wire)
         self._viewers.add(viewer)
