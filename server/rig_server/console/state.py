@@ -22,7 +22,10 @@ RIG = "rig"  # stands where a camera's id would
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Moment:
-    """Everything that the page's state is made of. `away_s`: for how long cameras gave no frame, by id."""
+    """Everything that the page's state is made of.
+
+    `away_s`: for how long cameras gave no frame, by id. `tiles_trouble`: why there are no tiles.
+    """
 
     place: str
     ended: bool
@@ -35,12 +38,15 @@ class Moment:
     health: Mapping[str, Mapping[str, float | None]] = field(default_factory=dict)
     away_s: Mapping[int, float] = field(default_factory=dict)
     orders: bool = True
+    tiles_trouble: str | None = None
 
 
 def page_state(moment: Moment) -> dict[str, Any]:
     """What the page is told a few times a second."""
     status = moment.status
     figures, troubles = summary(status)
+    if moment.tiles_trouble is not None:
+        troubles.append(f"pictures of the cameras: {moment.tiles_trouble}")
     return {
         "kind": "state",
         "place": moment.place,
