@@ -1,6 +1,8 @@
 """The files of a take that is being recorded: split by size, with room kept to end each in order."""
 
+import contextlib
 import errno
+import fcntl
 import tempfile
 from collections.abc import Callable, Mapping
 from datetime import UTC, datetime
@@ -31,6 +33,8 @@ class DiskFile:
             raise ConfigurationError(f"{path} exists: a recording overwrites nothing, give another name")
         try:
             self._file = path.open("wb", buffering=0)
+            with contextlib.suppress(OSError):  # some network disks have no locks
+                fcntl.flock(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB)  # for `recover`; ends with the process
             self._reserve = tempfile.TemporaryFile(dir=path.parent)  # noqa: SIM115  # open as long as this object
             self._reserve.write(bytes(_RESERVE_BYTES))
             self._reserve.flush()

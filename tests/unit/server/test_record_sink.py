@@ -19,7 +19,7 @@ from rig_protocol import recorder
 from rig_protocol.errors import ConfigurationError, RigError
 from rig_protocol.frames import EncodedFrame, Payload
 from rig_protocol.recorder import RecordingStatus, TakeContext
-from rig_protocol.recording import MANIFEST, Recording, part_paths
+from rig_protocol.recording import MANIFEST, Recording, part_paths, recover
 from rig_protocol.recording_format import DroppedFrames, RecordedSet
 from rig_protocol.take_file import TakeFile
 from rig_server import Rig
@@ -197,6 +197,21 @@ def test_a_disk_that_does_not_tell_its_room_holds_up_no_frames(
         asking.join(30)
         sink.start()
         sink.stop()
+
+
+def test_a_take_that_is_being_recorded_is_not_mended(tmp_path: Path) -> None:
+    """It would go on in what is kept as FILE.torn, which one deletes."""
+    path = tmp_path / "take.mcap"
+    sink = sink_to(path)
+    sink.start()
+    for k in range(5):
+        sink.add(frame(k))
+    with pytest.raises(RigError, match="is being recorded"):
+        recover(path)
+    sink.stop()
+    assert recover(path) == []
+    assert len(list(Recording(path).entries())) == 5
+    assert list(tmp_path.iterdir()) == [path]
 
 
 def test_a_take_does_not_become_a_part_of_another(tmp_path: Path) -> None:
