@@ -22,6 +22,7 @@ from typing import Any
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 from console_latency import looked_at
+
 from rig_protocol.frames import EncodedFrame
 from rig_protocol.recording import MANIFEST, Recording, recover
 from rig_server import Rig
