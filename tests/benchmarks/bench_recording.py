@@ -174,7 +174,7 @@ def console_sentence(seen: dict[str, Any]) -> str:
     """What a browser was shown of the replay."""
     if "skipped" in seen:
         return f"Replay beside the console was not measured: {seen['skipped']}."
-    return f"""The take replayed as fast as it was recorded, a headless Chromium looking at the console meanwhile:
+    return f"""The take replayed as fast as it was recorded, while a headless Chromium looks at the console:
 {seen["sets_per_s"]:.1f} sets and {seen["tiles_per_s"]:.0f} tiles a second."""
 
 
