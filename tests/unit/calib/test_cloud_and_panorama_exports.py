@@ -254,7 +254,7 @@ def test_an_mp4_video_is_h264_of_even_size_close_to_the_panoramas(
 ) -> None:
     # A circle that fits the small cameras of the test: on a finer one their pixels would stand apart.
     coarse = LiveFusionSettings(circle_px=705)
-    monkeypatch.setattr(video, "usual_settings", lambda _capture: coarse)
+    monkeypatch.setattr(video, "settings_of", lambda _job: coarse)
     job = export_job(take, tmp_path / "hall.mp4")
     video.export(job)
     seconds, images, metadata, codec = decoded(tmp_path / "hall.mp4")
