@@ -12,8 +12,9 @@ BENCH  := $(VENV)/.ready-bench
 demo: $(READY)  ## twelve simulated Kinects over loopback UDP, calibrated and fused into build/demo
 	$(BIN)/rig-server --calibrate --simulate 12 --frames 5 --out build/demo
 
+# A file's tests stay together: what they share is made once. In order: the long ones come first.
 test: $(READY)  ## the whole test suite
-	$(BIN)/pytest -n 2
+	$(BIN)/pytest -n 2 --dist loadfile --no-loadscope-reorder
 
 lint: $(READY)  ## style, types, import rules
 	$(BIN)/ruff check .

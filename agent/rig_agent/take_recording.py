@@ -42,7 +42,7 @@ class TakeRecording:
         self.rig_tie: ClockTie | None = None
         """What the server says of its clock against ours; set by whoever hears it."""
         context = TakeContext(lambda: self._documents, reading=self._reading, clock=AGENT)
-        target = _new_file(path, settings.display_name(settings.camera)) if path.is_dir() else path
+        target = _target(path, settings.display_name(settings.camera))
         self._recorder = Recorder(target, settings.record, context, threading.Condition(), now_ns)
         self._thread = threading.Thread(target=self._recorder.run, name="recorder", daemon=True)
 
@@ -88,6 +88,15 @@ class TakeRecording:
         if wall.error_ns is not None:
             ties = (*ties, ClockTie(UTC, wall.wall_minus_monotonic_ns, wall.error_ns))
         return ClockReading(now_ns(), ties) if ties else None
+
+
+def _target(path: Path, name: str) -> Path:
+    """The file to record to; ConfigurationError for what was meant as a folder, and is none."""
+    if path.is_dir():
+        return _new_file(path, name)
+    if path.suffix != ".mcap":
+        raise ConfigurationError(f"{path} is no folder: make it (mkdir -p {path}), or name a file FILE.mcap")
+    return path
 
 
 def _new_file(folder: Path, name: str) -> Path:

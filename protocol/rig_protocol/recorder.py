@@ -3,6 +3,7 @@
 For the shells of agent and server, which run it in a thread of theirs: lock and clock are handed to it.
 """
 
+import contextlib
 import logging
 import shutil
 from collections import Counter, deque
@@ -155,6 +156,7 @@ class Recorder:
 
     def status(self) -> RecordingStatus:
         """How the recording is, at this moment; any thread may ask."""
+        free_bytes = _free_bytes(self._path)  # a disk that hangs must not hold up who gives frames
         with self._changed:
             running = self._ended is None and not self._stopping
             lasted_ns = self._now_ns() - self._started_ns if running else self._lasted_ns
@@ -165,7 +167,7 @@ class Recorder:
                 bytes=self._file.size,
                 dropped=self._dropped.total(),
                 waiting_bytes=self._waiting_bytes,
-                free_bytes=_free_bytes(self._path) - self._settings.keep_free_mib * _MIB,
+                free_bytes=free_bytes - self._settings.keep_free_mib * _MIB,
                 ended=self._ended,
             )
 
@@ -182,6 +184,8 @@ class Recorder:
             self._end(f"{error!r}; `rig-server recover {self._path}` mends the file")
         finally:
             self._lasted_ns = self._now_ns() - self._started_ns
+            with contextlib.suppress(OSError):  # it has been told already
+                self._file.close()
 
     def _drop(self, camera_id: int, time_ns: int) -> None:
         """Note a frame for which there is no room; the lock is held."""

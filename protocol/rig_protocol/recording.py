@@ -3,6 +3,7 @@
 FILE is the first part of a take; where it was split, FILE.001.mcap and so on go on. Every part stands alone.
 """
 
+import fcntl
 import json
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import closing
@@ -260,9 +261,22 @@ def part_paths(path: Path) -> list[Path]:
 def recover(path: Path) -> list[Path]:
     """Rewrite the parts of a take that are torn or damaged, each kept as FILE.torn; those rewritten.
 
-    ConfigurationError where a file cannot be read or written, DataError for what is no recording.
+    ConfigurationError where a file cannot be read or written, DataError for what is no recording, RigError
+    while it is being recorded.
     """
+    for part in part_paths(path):
+        _refuse_while_recorded(part)
     return [part for part in part_paths(path) if _recover_part(part)]
+
+
+def _refuse_while_recorded(path: Path) -> None:
+    with closing(open_recording(path)) as file:
+        try:
+            fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)
+        except BlockingIOError as error:
+            raise RigError(f"{path} is being recorded: end that first") from error
+        except OSError:  # some network disks have no locks
+            return
 
 
 def _recover_part(path: Path) -> bool:

@@ -1,6 +1,8 @@
 """The files of a take that is being recorded: split by size, with room kept to end each in order."""
 
+import contextlib
 import errno
+import fcntl
 import tempfile
 from collections.abc import Callable, Mapping
 from datetime import UTC, datetime
@@ -31,6 +33,8 @@ class DiskFile:
             raise ConfigurationError(f"{path} exists: a recording overwrites nothing, give another name")
         try:
             self._file = path.open("wb", buffering=0)
+            with contextlib.suppress(OSError):  # some network disks have no locks
+                fcntl.flock(self._file, fcntl.LOCK_EX | fcntl.LOCK_NB)  # for `recover`; ends with the process
             self._reserve = tempfile.TemporaryFile(dir=path.parent)  # noqa: SIM115  # open as long as this object
             self._reserve.write(bytes(_RESERVE_BYTES))
             self._reserve.flush()
@@ -85,6 +89,7 @@ class TakeFile:
         clock: str | None = None,
         moment: Callable[[], tuple[str, int]] | None = None,
     ) -> None:
+        _refuse_strange_parts(path)
         self._path, self._part_bytes = path, part_bytes
         self._now_ns, self._clock, self._moment = now_ns, clock, moment or self._now
         self._number, self._before = 0, 0
@@ -124,6 +129,10 @@ class TakeFile:
         finally:
             self._disk.close()
 
+    def close(self) -> None:
+        """Let go of the disk, as after an error; what was written stays. Harmless when already ended."""
+        self._disk.close()
+
     def _open(self) -> None:
         self._disk = DiskFile(part_path(self._path, self._number))
         created, now_ns = self._moment()
@@ -143,3 +152,14 @@ class TakeFile:
     def _finish_part(self, cameras: Mapping[str, Mapping[str, int]]) -> None:
         self._writer.finish(cameras, self._now_ns())
         self._disk.close()
+
+
+def _refuse_strange_parts(path: Path) -> None:
+    """ConfigurationError where readers would take this and another take for parts of one."""
+    after = part_path(path, 1)
+    if after.exists():
+        raise ConfigurationError(f"{after} exists, and would be read as a part of {path}: give another name")
+    name, _, number = path.stem.rpartition(".")
+    first = path.with_name(name + path.suffix)
+    if len(number) >= 3 and number.isdecimal() and first.exists():
+        raise ConfigurationError(f"{path} would be read as a part of {first}: give another name")

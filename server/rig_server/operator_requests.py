@@ -78,8 +78,10 @@ class OperatorRequests:
 
 def find_camera_id(camera: Any, names: Mapping[int, str]) -> int:
     """A camera by id or name; ConfigurationError names those that there are."""
-    for camera_id, name in names.items():
-        if str(camera) in (str(camera_id), name):
-            return camera_id
+    told = str(camera)
+    ids = [camera_id for camera_id in names if told == str(camera_id)]  # a name may be another one's number
+    found = ids or [camera_id for camera_id, name in names.items() if told == name]
+    if found:
+        return found[0]
     known = ", ".join(f"{name} ({camera_id})" for camera_id, name in sorted(names.items())) or "none yet"
     raise ConfigurationError(f"there is no camera {camera!r}: this rig has {known}, or write {ALL}")

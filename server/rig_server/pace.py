@@ -10,9 +10,9 @@ class Pace:
         self._speed = speed
         self._begun: tuple[float, int] | None = None
 
-    def restart(self) -> None:
-        """The next one is due at once."""
-        self._begun = None
+    def restart(self, time_ns: int) -> None:
+        """What was recorded at `time_ns` is due now."""
+        self._begun = time.monotonic(), time_ns
 
     def wait(self, time_ns: int, timeout_s: float) -> bool:
         """Wait until it is due, but no longer than `timeout_s`; False when it is not due then."""

@@ -145,6 +145,7 @@ class LivePipeline:
     def end_sets(self) -> None:
         """Say goodbye to the cameras and end all threads but that of a recording, which stays open."""
         self._receiver.stop()
+        self._remote.close()
         self._decoder.close()
 
     def stop(self) -> None:

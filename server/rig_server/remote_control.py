@@ -2,9 +2,9 @@
 
 import time
 from collections.abc import Callable, Collection
-from concurrent.futures import Future, wait
+from concurrent.futures import FIRST_COMPLETED, Future, wait
 
-from rig_protocol.errors import ConfigurationError, LinkUsageError
+from rig_protocol.errors import ConfigurationError, LinkUsageError, RigError
 from rig_protocol.events import ControlAnswered, Outcome
 from rig_protocol.message_bytes import encode_body
 from rig_protocol.messages import Control, ControlValue
@@ -23,6 +23,7 @@ class RemoteControl:
     def __init__(self, link: ServerLink, post: Post) -> None:
         self._link, self._post = link, post
         self._asked: dict[int, Future[ControlAnswered]] = {}  # by ticket; the receiver's thread's own
+        self._ended = Future[ControlAnswered]()  # wakes who waits
 
     def control(
         self, camera_ids: Collection[int], name: str, value: ControlValue
@@ -43,12 +44,19 @@ class RemoteControl:
                 self._asked[self._link.control(camera_id, name, value, now_ns)] = future
 
         self._post(ask)
-        wait(futures.values(), until_s - time.monotonic())
+        waiting = set(futures.values())
+        while waiting and not self._ended.done() and (left_s := until_s - time.monotonic()) > 0:
+            waiting -= wait({*waiting, self._ended}, left_s, FIRST_COMPLETED).done
         silent = "the server stopped, or did not get to it"
         return {
             i: future.result() if future.done() else ControlAnswered(i, 0, Outcome.UNANSWERED, silent)
             for i, future in futures.items()
         }
+
+    def close(self) -> None:
+        """No answer will come any more: nobody waits for one. Harmless when already closed."""
+        if not self._ended.done():
+            self._ended.set_exception(RigError("the server does not run"))
 
     def take(self, answer: ControlAnswered) -> None:
         """On the receiver's thread: an agent has answered."""

@@ -68,7 +68,7 @@ class ReplayedRig:
         self.calibration = _calibration_of(self._recording)
         self._has_sets = self._recording.has_sets
         span_s = (self._recording.end_ns - self._recording.start_ns) / 1e9
-        if options.seek_s > span_s:
+        if not options.seek_s <= span_s:  # no number is beyond it, too
             raise ConfigurationError(f"--seek {options.seek_s:g}: {take} lasts {span_s:.1f} s")
         for part in self._recording.torn:
             logger.warning("%s was not finished: it is read as far as it goes", part)
@@ -184,12 +184,12 @@ class ReplayedRig:
         from_ns = self._recording.start_ns + int(self._options.seek_s * 1e9)
         while True:
             first = last = None
-            self._pace.restart()
             for one in with_frames(self._entries(max(0, from_ns - _LEAD_IN_NS)), from_ns):
                 yield _later(one, index, shift_ns)
                 first, last = first or one, one
             if first is None or last is None or not self._options.loop:
                 return
+            self._pace.restart(last.time_ns + shift_ns)
             index += last.index + 1
             exposed_ns = max(_exposures_ns(last)) - min(_exposures_ns(first))
             shift_ns += max(last.time_ns - first.time_ns, exposed_ns) + _BETWEEN_ROUNDS_NS
@@ -223,7 +223,10 @@ class ReplayedRig:
         offset_ns = self._recording.utc_minus_rig_time_ns
         if offset_ns is None:
             return "", 0
-        utc = datetime.fromtimestamp((self._now_ns + offset_ns) / 1e9, UTC)
+        try:
+            utc = datetime.fromtimestamp((self._now_ns + offset_ns) / 1e9, UTC)
+        except (ValueError, OverflowError, OSError):  # a date out of reason
+            return "", 0
         return utc.isoformat(timespec="seconds"), self._now_ns
 
     def _entries(self, from_ns: int) -> Iterator[Entry]:

@@ -21,19 +21,22 @@ from typing import Any
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
+from console_latency import looked_at
+
 from rig_protocol.frames import EncodedFrame
 from rig_protocol.recording import MANIFEST, Recording, recover
 from rig_server import Rig
-from rig_server.config import RigSettings
+from rig_server.config import ConsoleSettings, RigSettings
 from rig_server.replay import ReplayOptions
 from support.benchmark_record import machine, merge_results, results_of, write_section
+from support.browser import chromium_path
 from support.key_for_tests import rig_key_file
 from support.preencoded_frames import PreencodedFrames
 from support.preencoded_sender import Play, encoded_file, sender_process, total
 from support.rig_processes import free_port
 
 CAMERAS, FPS = 12, 30.0
-SECONDS, KILL_SECONDS = 60.0, 12.0
+SECONDS, LOOK_SECONDS, KILL_SECONDS = 60.0, 10.0, 12.0
 _PROBE_BYTES = 1 << 30
 
 
@@ -94,6 +97,16 @@ def recorded(take: Path, seconds: float, file: Path, sent: PreencodedFrames) -> 
     }
 
 
+def replayed_beside_console(take: Path) -> dict[str, Any]:
+    """The take played as fast as it was recorded, while a browser looks at the console."""
+    chromium = chromium_path()
+    if chromium is None:
+        return {"skipped": "there is no Chromium on this machine: apt install chromium"}
+    settings = RigSettings(console=ConsoleSettings(listen="127.0.0.1:0"))
+    seen = looked_at(Rig.replayed(take, settings, ReplayOptions(loop=True)), LOOK_SECONDS, chromium)
+    return {name: seen[name] for name in ("sets_per_s", "tiles_per_s")}
+
+
 def killed(take: Path, seconds: float, file: Path) -> dict[str, Any]:
     """A take whose server is killed in the middle."""
     with recording_server(take) as (server, port):
@@ -145,6 +158,7 @@ def measure(folder: Path, seconds: float = SECONDS) -> dict[str, Any]:
     with encoded_file() as (file, sent):
         take = folder / "whole.mcap"
         results |= recorded(take, seconds, file, sent)
+        results["console_beside_replay"] = replayed_beside_console(take)
         take.unlink()
         return results | killed(folder / "killed.mcap", KILL_SECONDS, file)
 
@@ -154,6 +168,14 @@ def _wait_for_bytes(take: Path, size: float) -> None:
     while not take.is_file() or take.stat().st_size < size:
         assert time.monotonic() < until_s, "nothing is recorded"
         time.sleep(0.02)
+
+
+def console_sentence(seen: dict[str, Any]) -> str:
+    """What a browser was shown of the replay."""
+    if "skipped" in seen:
+        return f"Replay beside the console was not measured: {seen['skipped']}."
+    return f"""The take replayed as fast as it was recorded, while a headless Chromium looks at the console:
+{seen["sets_per_s"]:.1f} sets and {seen["tiles_per_s"]:.0f} tiles a second."""
 
 
 def report(results: dict[str, Any]) -> str:
@@ -170,6 +192,8 @@ Encoded frames of real Kinect images, twelve cameras at 30 frames a second over 
 **{results["record_dropped"]} dropped by the recorder**, {results["network_lost"]} lost by the network;
 {results["wrong"]} payloads differ from those sent; {results["mb_s"]:.1f} MB/s.
 A plain writer fills this disk with {results["disk_mb_s"]:.0f} MB/s.
+
+{console_sentence(results["console_beside_replay"])}
 
 Killed with signal 9 in the middle of a take: the file lacks the last **{results["kill_lost_s"]:.2f} s**. Its
 {results["torn_sets"]} sets are {same}, bit for bit, before and after `rig-server recover`."""

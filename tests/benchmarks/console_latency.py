@@ -45,13 +45,14 @@ def console_latency(seconds: float = 15.0, cameras: int = 12, fps: float = 30.0)
     )
     rig = Rig.live(settings)
     play = Play(rig.place.removeprefix("UDP "), range(cameras), fps, seconds + 60.0)
-    with (
-        RigConsole(rig) as console,
-        _taken(rig),
-        encoded_file() as (file, _),
-        sender_process(play, file),
-        browser(chromium, webgl=False) as opened,
-    ):
+    with encoded_file() as (file, _), sender_process(play, file):
+        seen = looked_at(rig, seconds, chromium)
+    return {"console_latency_ms": seen["p95_ms"], **seen, "cameras": cameras, "fps": fps}
+
+
+def looked_at(rig: Rig, seconds: float, chromium: Path) -> dict[str, float | None]:
+    """What a browser that looks at a rig for so many seconds is shown; the settings have a console."""
+    with RigConsole(rig) as console, _taken(rig), browser(chromium, webgl=False) as opened:
         page = opened.new_page(viewport={"width": 1440, "height": 900})
         page.goto(console.link)
         page.wait_for_selector(".tile:not(.gone)", timeout=60_000)
@@ -61,14 +62,8 @@ def console_latency(seconds: float = 15.0, cameras: int = 12, fps: float = 30.0)
         seen, status = console.latency().since(before), rig.status()
         lasted_s = time.monotonic() - begin_s
     told = {name: _ms(seen.quantile_ns(share)) for name, share in SHARES.items()}
-    return {
-        "console_latency_ms": told["p95_ms"],
-        **told,
-        "tiles_per_s": round(seen.count / lasted_s, 1),
-        "sets_per_s": round(status.sets_per_s, 1),
-        "cameras": cameras,
-        "fps": fps,
-    }
+    rates = {"tiles_per_s": round(seen.count / lasted_s, 1), "sets_per_s": round(status.sets_per_s, 1)}
+    return {**told, **rates}
 
 
 @contextmanager

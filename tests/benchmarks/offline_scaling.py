@@ -178,8 +178,12 @@ def scaling_table(results: Mapping[str, Any]) -> str:
 def limit_table(results: Mapping[str, Any]) -> str:
     """Where to stop adding workers."""
     found = limits(results)
-    rows = [[link, *(f"{found[form][link]:.0f}" for form in WHAT)] for link in LINKS_MB_S]
+    rows = [[link, *(_cores(found[form][link]) for form in WHAT)] for link in LINKS_MB_S]
     return markdown_table(["shared by all workers", *(f"{what}: full at" for what in WHAT.values())], rows)
+
+
+def _cores(count: float) -> str:
+    return f"{count:.1f}" if count < 2 else f"{count:.0f}"
 
 
 def equal(results: Mapping[str, Any]) -> bool:

@@ -8,13 +8,17 @@ import sys
 import time
 from collections.abc import Iterator
 from pathlib import Path
+from typing import cast
 
 import cv2
 import numpy as np
 import pytest
+from aiohttp import web
 from mcap.reader import make_reader
 from playwright.sync_api import Page, WebSocket, expect
 
+from rig_server.console.scene_proxy import SceneProxy
+from rig_server.console.web_server import WebServer
 from support.browser import browser, chromium_path
 
 pytestmark = [
@@ -160,3 +164,45 @@ def test_a_person_watches_calibrates_and_records_the_rig_in_a_browser(
     output, _ = process.communicate(timeout=60)
     assert "Traceback" not in output
     assert process.returncode == 0
+
+
+class NoDesk:
+    """Nothing is behind the page."""
+
+    def state(self) -> dict[str, object]:
+        return {"kind": "none"}
+
+    def history(self) -> dict[str, object]:
+        return {"series": {}}
+
+    def act(self, action: str, _: object) -> str:
+        return action
+
+    def painted(self, _: object) -> None:
+        return
+
+
+class NoScene:
+    """Nor is there a scene."""
+
+    async def open(self) -> None:
+        return
+
+    async def close(self) -> None:
+        return
+
+    async def handle(self, _: web.Request) -> web.StreamResponse:
+        return web.Response()
+
+
+def test_a_page_whose_server_began_anew_asks_for_the_new_token(page: Page) -> None:
+    scene = cast(SceneProxy, NoScene())
+    with WebServer(("127.0.0.1", 0), "the first token!", NoDesk(), scene) as first:
+        port = int(first.url.rstrip("/").rpartition(":")[2])
+        page.goto(f"{first.url}?token=the first token!")
+        expect(page.locator("#connection")).to_have_text("connected")
+    expect(page.locator("#connection")).to_contain_text("trying again")
+    with WebServer(("127.0.0.1", port), "the second token", NoDesk(), scene):
+        page.locator("input[name=token]").fill("the second token")
+        page.locator("button").click()
+        expect(page.locator("#connection")).to_have_text("connected")

@@ -168,6 +168,7 @@ class RigConsole:
                 fusion=self._fuse.report(),
                 latency=recent[_LATENCY],
                 orders=self._orders,
+                tiles_trouble=self._tiles.failure,
                 health=latest_health(self._history, tuple(one.camera_id for one in status.cameras)),
                 away_s={camera_id: now_s - last_s for camera_id, last_s in dict(self._last_s).items()},
             )

@@ -22,7 +22,10 @@ RIG = "rig"  # stands where a camera's id would
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Moment:
-    """Everything that the page's state is made of. `away_s`: for how long cameras gave no frame, by id."""
+    """Everything that the page's state is made of.
+
+    `away_s`: for how long cameras gave no frame, by id. `tiles_trouble`: why there are no tiles.
+    """
 
     place: str
     ended: bool
@@ -35,12 +38,15 @@ class Moment:
     health: Mapping[str, Mapping[str, float | None]] = field(default_factory=dict)
     away_s: Mapping[int, float] = field(default_factory=dict)
     orders: bool = True
+    tiles_trouble: str | None = None
 
 
 def page_state(moment: Moment) -> dict[str, Any]:
     """What the page is told a few times a second."""
     status = moment.status
     figures, troubles = summary(status)
+    if moment.tiles_trouble is not None:
+        troubles.append(f"pictures of the cameras: {moment.tiles_trouble}")
     return {
         "kind": "state",
         "place": moment.place,
@@ -100,7 +106,7 @@ def session_state(view: SessionView) -> dict[str, Any]:
         "pairs": [_pair(pair) for pair in view.pairs],
         "failures": list(view.failures),
         "missed": view.missed,
-        "moved": {str(camera): list(by) for camera, by in view.moved.items()},
+        "moved": {str(camera): list(map(plain, by)) for camera, by in view.moved.items()},
         "message": view.message,
     }
 
@@ -170,8 +176,8 @@ def _pair(pair: PairSupport) -> dict[str, Any]:
     return {
         "name": pair.name,
         "matches": pair.matches,
-        "deg": None if expected is None else round(expected.deg, 4),
-        "mm": None if expected is None else round(expected.mm, 2),
+        "deg": None if expected is None else plain(expected.deg),
+        "mm": None if expected is None else plain(expected.mm),
         "support": pair.support,
         "advice": pair.advice,
     }

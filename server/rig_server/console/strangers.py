@@ -1,7 +1,7 @@
 """Connections of strangers: a bounded number, of which the oldest gives way."""
 
 import asyncio
-from collections.abc import Callable
+from collections.abc import Sequence
 
 from aiohttp import web
 
@@ -13,46 +13,32 @@ _SETTLED_S = 0.1  # a burst of connections is accepted before any of them has it
 class Doorkeeper:
     """Makes the protocol of every connection; one is a stranger's until a request of it brought the token."""
 
-    def __init__(self, server: Callable[[], asyncio.BaseProtocol]) -> None:
+    def __init__(self, server: web.Server) -> None:
         self._server = server
-        self._strangers, self._known = _Queue(_MAX_STRANGERS), _Queue(_MAX_KNOWN)
+        self._known: set[object] = set()
+        self._looks_soon = False
 
     def __call__(self) -> asyncio.BaseProtocol:
         """The protocol of a new connection."""
-        protocol = self._server()
-        self._strangers.add(protocol)
-        return protocol
+        if not self._looks_soon:
+            self._looks_soon = True
+            asyncio.get_running_loop().call_later(_SETTLED_S, self._look)
+        return self._server()
 
     def admit(self, request: web.Request) -> None:
         """The request brought the token: its connection is no stranger's any more."""
-        if self._strangers.remove(request.protocol):
-            self._known.add(request.protocol)
+        self._known.add(request.protocol)
+
+    def _look(self) -> None:
+        """Hang up on the oldest where there are too many; the server lists them by age."""
+        self._looks_soon = False
+        open_now = self._server.connections
+        self._known.intersection_update(open_now)
+        _hang_up([one for one in open_now if one not in self._known], _MAX_STRANGERS)
+        _hang_up([one for one in open_now if one in self._known], _MAX_KNOWN)
 
 
-class _Queue:
-    """Connections, oldest first, and whether each has begun: its transport comes a moment after it."""
-
-    def __init__(self, most: int) -> None:
-        self._most = most
-        self._begun: dict[asyncio.BaseProtocol, bool] = {}
-
-    def add(self, protocol: asyncio.BaseProtocol) -> None:
-        """One more; where there are too many, hang up on the oldest."""
-        self._begun[protocol] = False
-        if len(self._begun) > self._most:
-            asyncio.get_running_loop().call_later(_SETTLED_S, self._shorten)
-
-    def _shorten(self) -> None:
-        for one, begun in list(self._begun.items()):
-            transport = getattr(one, "transport", None)
-            if transport is None and begun:  # it has ended
-                del self._begun[one]
-            elif isinstance(transport, asyncio.Transport):
-                self._begun[one] = True
-                if len(self._begun) > self._most:
-                    del self._begun[one]
-                    transport.abort()
-
-    def remove(self, protocol: asyncio.BaseProtocol) -> bool:
-        """Whether it was there."""
-        return self._begun.pop(protocol, None) is not None
+def _hang_up(connections: Sequence[web.RequestHandler], most: int) -> None:
+    for one in connections[: max(len(connections) - most, 0)]:
+        if isinstance(one.transport, asyncio.Transport):
+            one.transport.abort()

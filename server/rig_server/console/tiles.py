@@ -1,13 +1,18 @@
 """Tiles: one set as small upright JPEG pictures, encoded once for everybody who looks."""
 
+import logging
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass
+
+import cv2
 
 from rig_protocol.camera import RawDepthModel
 from rig_protocol.frames import ImageU8, PanoramicFrame, RgbdFrame
 from rig_server.console.camera_pictures import Mode, color_picture, depth_picture, jpeg
 from rig_server.console.picture_guide import PictureGuide
 from rig_server.console.upright import felt_turns, turned
+
+logger = logging.getLogger(__name__)
 
 _LONGEST_WAY_NS = 10_000_000_000
 
@@ -57,7 +62,7 @@ def tile_round(
         if frame is None:
             continue
         for mode, full in {(look.mode, look.enlarged == camera_id) for look in looks}:
-            image = camera_picture(frame, guide, mode, full)
+            image = _picture(frame, guide, mode, full)
             if image is None:
                 continue
             received_ns = _received_ns(frame, offered_ns)
@@ -78,6 +83,15 @@ def camera_picture(frame: RgbdFrame, guide: PictureGuide, mode: Mode, full: bool
         image = guide.tints[frame.camera_id].over(image)
     turns = guide.turns.get(frame.camera_id, 0) if frame.gravity is None else felt_turns(frame.gravity)
     return turned(image, turns)
+
+
+def _picture(frame: RgbdFrame, guide: PictureGuide, mode: Mode, full: bool) -> ImageU8 | None:
+    """None also for images that OpenCV refuses, as of one pixel: all other cameras are shown."""
+    try:
+        return camera_picture(frame, guide, mode, full)
+    except cv2.error as error:
+        logger.debug("camera %d has no picture: %s", frame.camera_id, error)
+        return None
 
 
 def _received_ns(frame: RgbdFrame, offered_ns: int) -> int:

@@ -7,11 +7,13 @@ import logging
 import socket
 import threading
 from collections.abc import AsyncIterator, Awaitable, Callable
+from concurrent.futures import ThreadPoolExecutor
 from importlib import resources
 from types import TracebackType
 from typing import Any, Protocol, Self
 
 from aiohttp import WSMsgType, web
+from aiohttp.http import HttpProcessingError
 
 from rig_protocol.errors import ConfigurationError, RigError
 from rig_protocol.events import Address
@@ -25,6 +27,8 @@ from rig_server.console.viewer import Viewer
 from rig_server.tcp_socket import listening_socket
 
 logger = logging.getLogger(__name__)
+_port_log = logging.getLogger(f"{__name__}.port")
+_port_log.addFilter(lambda record: not _is_of_a_malformed_request(record))
 
 _STATE_S = 0.5
 _MAX_VIEWERS = 16
@@ -154,7 +158,9 @@ class WebServer:
 
     async def _serve(self) -> None:
         self._loop = asyncio.get_running_loop()
-        runner = web.AppRunner(self._app(), access_log=None, handle_signals=False, shutdown_timeout=1.0)
+        runner = web.AppRunner(
+            self._app(), access_log=None, logger=_port_log, handle_signals=False, shutdown_timeout=1.0
+        )
         await runner.setup()
         assert runner.server is not None  # noqa: S101  # so says its setup
         self._doorkeeper = Doorkeeper(runner.server)
@@ -276,16 +282,35 @@ class WebServer:
         return True
 
     async def _tell_state(self) -> None:
-        while True:
-            try:
-                self._state = json.dumps(await asyncio.to_thread(self._desk.state), separators=(",", ":"))
-            except Exception:  # the next one may be told
-                logger.exception("the console cannot read the rig's state")
-            for viewer in self._viewers:
-                viewer.tell("state", self._state)
-            self._tell_now.clear()
-            with contextlib.suppress(TimeoutError):
-                await asyncio.wait_for(self._tell_now.wait(), _STATE_S)
+        assert self._loop is not None  # noqa: S101  # it runs us
+        failing = False
+        # A thread of its own: orders may wait for an agent's answer on all those that there are.
+        with ThreadPoolExecutor(1, thread_name_prefix="console state") as reader:
+            while True:
+                try:
+                    state = await self._loop.run_in_executor(reader, self._desk.state)
+                    self._state = json.dumps(state, separators=(",", ":"), allow_nan=False)
+                    failing = False
+                    for viewer in self._viewers:
+                        viewer.tell("state", self._state)
+                except Exception:  # the next one may be told
+                    if not failing:
+                        logger.exception("the console cannot read the rig's state")
+                    failing = True
+                await self._until_it_is_time()
+
+    async def _until_it_is_time(self) -> None:
+        self._tell_now.clear()
+        # Not wait_for: before Python 3.12 that loses a cancellation which comes together with the event.
+        with contextlib.suppress(TimeoutError):
+            async with asyncio.timeout(_STATE_S):
+                await self._tell_now.wait()
+
+
+def _is_of_a_malformed_request(record: logging.LogRecord) -> bool:
+    """Anybody may send one, as often as they like: it is answered, and no news."""
+    error = record.exc_info[1] if record.exc_info else None
+    return isinstance(error, HttpProcessingError | web.RequestPayloadError)
 
 
 def _look(said: dict[str, Any]) -> Look | None:

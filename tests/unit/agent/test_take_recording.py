@@ -113,6 +113,12 @@ def test_a_second_start_in_a_folder_begins_another_take(tmp_path: Path) -> None:
     assert len(list(tmp_path.iterdir())) == 2
 
 
+def test_a_folder_that_is_not_there_is_no_file(tmp_path: Path) -> None:
+    with pytest.raises(ConfigurationError, match="mkdir -p"):
+        Agent(settings_for(tmp_path / "takes"), None, SmallSource)
+    assert list(tmp_path.iterdir()) == []
+
+
 def test_an_existing_file_is_not_overwritten(tmp_path: Path) -> None:
     (tmp_path / "take.mcap").write_bytes(b"dear")
     with pytest.raises(ConfigurationError, match="exists"):

@@ -19,7 +19,7 @@ import pye57
 import pytest
 from pypcd4 import PointCloud
 
-from rig_calib.frame_exports import frame_files, fused_batches, ply, video
+from rig_calib.frame_exports import frame_files, ply, video
 from rig_calib.frame_exports.formats import FORMATS
 from rig_calib.frame_exports.fused_batches import borrowed_fusion, fused_batch
 from rig_calib.frame_exports.job import ExportJob
@@ -254,7 +254,7 @@ def test_an_mp4_video_is_h264_of_even_size_close_to_the_panoramas(
 ) -> None:
     # A circle that fits the small cameras of the test: on a finer one their pixels would stand apart.
     coarse = LiveFusionSettings(circle_px=705)
-    monkeypatch.setattr(fused_batches, "usual_settings", lambda _capture: coarse)
+    monkeypatch.setattr(video, "settings_of", lambda _job: coarse)
     job = export_job(take, tmp_path / "hall.mp4")
     video.export(job)
     seconds, images, metadata, codec = decoded(tmp_path / "hall.mp4")

@@ -74,6 +74,21 @@ def test_a_session_is_told_with_its_coach() -> None:
     ]
 
 
+def test_what_cannot_be_estimated_is_unknown_and_silences_no_page() -> None:
+    """A browser's JSON has no NaN: one of them and it shows nothing of the state."""
+    unknown = PairSupport(0, 1, "cam00–cam01", 3, True, Accuracy(np.nan, np.inf), Support.WEAK)
+    session = SessionView(Phase.READY, pairs=(unknown,), moved={1: (np.nan, 3.0)})
+    told_session = told(a_moment(session=session))["session"]
+    assert isinstance(told_session, dict)
+    assert (told_session["pairs"][0]["deg"], told_session["pairs"][0]["mm"]) == (None, None)
+    assert told_session["moved"] == {"1": [None, 3.0]}
+
+
+def test_why_there_are_no_pictures_is_told() -> None:
+    assert "trouble" not in str(told(a_moment())["troubles"])
+    assert "pictures of the cameras: a trouble" in str(told(a_moment(tiles_trouble="a trouble"))["troubles"])
+
+
 def test_health_is_told_by_camera_and_what_is_unknown_is_no_number() -> None:
     history = HealthHistory()
     for second in range(3):

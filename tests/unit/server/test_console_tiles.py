@@ -135,6 +135,15 @@ def test_only_what_is_looked_at_is_made_and_a_missing_camera_has_no_tile() -> No
     assert decoded.shape == (640, 480, 3)
 
 
+def test_an_image_that_is_none_leaves_the_other_cameras_their_tiles() -> None:
+    """An agent may send what it likes: images of one pixel, too."""
+    good = as_the_sensor_sees_it(1)
+    for shape in ((1, 1), (481, 641)):
+        odd = RgbdFrame(1, 0, 0, bayer=np.zeros(shape, np.uint8))
+        made = tile_round(PanoramicFrame.of(0, {0: good, 1: odd}), 5, UNKNOWN, [Look()])
+        assert (Mode.COLOR, 0, False) in made.tiles
+
+
 def test_a_tile_is_timed_from_its_last_datagram_and_a_recordings_from_when_it_was_played() -> None:
     frame = replace(as_the_sensor_sees_it(0), received_ns=90_000_000)
     live = tile_round(PanoramicFrame.of(0, {0: frame}), 100_000_000, UNKNOWN, [Look()])

@@ -3,8 +3,10 @@
 import asyncio
 import contextlib
 import json
+import os
 import re
 import socket
+import threading
 from collections.abc import Awaitable, Callable, Iterator
 from pathlib import Path
 from typing import Any, cast
@@ -257,6 +259,114 @@ def test_strangers_who_hold_connections_keep_nobody_out(server: WebServer) -> No
     finally:
         for one in idle:
             one.close()
+
+
+def test_connections_that_ended_count_no_more(server: WebServer) -> None:
+    """Of a prober that comes every minute for months, and of all that pages once fetched."""
+    host, port = "127.0.0.1", int(server.url.rstrip("/").rpartition(":")[2])
+    for header in ("", f"Authorization: Bearer {TOKEN}\r\n"):
+        for _ in range(300):
+            with socket.create_connection((host, port)) as one:
+                one.sendall(f"GET / HTTP/1.1\r\nHost: x\r\n{header}Connection: close\r\n\r\n".encode())
+                while one.recv(65536):
+                    pass
+
+    async def ask(session: aiohttp.ClientSession) -> None:
+        async with session.ws_connect("/live") as live:
+            for _ in range(3):  # it is not hung up on
+                assert json.loads(await live.receive_str())["kind"] == "state"
+
+    browse(server, ask, headers=BEARER)
+
+
+@pytest.mark.parametrize(
+    "garbage",
+    [
+        b"\x16\x03\x01 garbage\r\n\r\n",
+        b"GET /" + b"b" * 20_000 + b" HTTP/1.1\r\n\r\n",
+        b"GET / HTTP/1.1\r\n\r\n",
+    ],
+)
+def test_garbage_of_strangers_fills_no_log(
+    server: WebServer, garbage: bytes, caplog: pytest.LogCaptureFixture
+) -> None:
+    host, port = "127.0.0.1", int(server.url.rstrip("/").rpartition(":")[2])
+    with socket.create_connection((host, port), timeout=20) as one:
+        one.sendall(garbage)
+        assert b" 400 " in one.recv(65536)
+    assert caplog.records == []
+
+
+class BusyDesk(FakeDesk):
+    """Its orders wait until `release`."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.begun, self.release = threading.Semaphore(0), threading.Event()
+
+    def act(self, action: str, wanted: dict[str, Any]) -> str:
+        self.begun.release()
+        assert self.release.wait(60)
+        return super().act(action, wanted)
+
+
+def test_orders_that_wait_for_an_agent_hold_up_no_state() -> None:
+    desk = BusyDesk()
+    server = WebServer(("127.0.0.1", 0), TOKEN, desk, cast(SceneProxy, FakeScene()))
+    threads = min(32, (os.cpu_count() or 1) + 4)  # that an event loop has for what waits
+
+    async def ask(session: aiohttp.ClientSession) -> None:
+        orders = [asyncio.create_task(session.post("/do/identify", json={})) for _ in range(threads)]
+        for _ in range(threads):
+            assert await asyncio.to_thread(desk.begun.acquire, timeout=20)
+        try:
+            async with session.ws_connect("/live") as live:
+                for _ in range(4):  # the first is an old one
+                    assert json.loads(await live.receive_str(timeout=10))["kind"] == "state"
+        finally:
+            desk.release.set()
+        for order in orders:
+            assert (await order).status == 200
+
+    with server:
+        browse(server, ask, headers=BEARER)
+
+
+def test_an_order_under_way_does_not_keep_the_console_from_ending() -> None:
+    desk = BusyDesk()
+    server = WebServer(("127.0.0.1", 0), TOKEN, desk, cast(SceneProxy, FakeScene()))
+    host, port = "127.0.0.1", int(server.url.rstrip("/").rpartition(":")[2])
+    server.__enter__()
+    ending = threading.Thread(target=server.__exit__, args=(None, None, None), daemon=True)
+    with socket.create_connection((host, port), timeout=20) as one:
+        head = f"POST /do/identify HTTP/1.1\r\nHost: x\r\nAuthorization: Bearer {TOKEN}\r\n"
+        one.sendall(f"{head}Content-Length: 2\r\n\r\n{{}}".encode())
+        assert desk.begun.acquire(timeout=20)
+        ending.start()
+        assert one.recv(65536) == b""  # it was hung up on
+    desk.release.set()
+    ending.join(20)
+    assert not ending.is_alive()
+
+
+class BrokenDesk(FakeDesk):
+    """Has no state."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.asked = threading.Semaphore(0)
+
+    def state(self) -> dict[str, Any]:
+        self.asked.release()
+        raise ValueError("no state")
+
+
+def test_a_state_that_cannot_be_read_is_told_once(caplog: pytest.LogCaptureFixture) -> None:
+    desk = BrokenDesk()
+    with WebServer(("127.0.0.1", 0), TOKEN, desk, cast(SceneProxy, FakeScene())):
+        for _ in range(3):
+            assert desk.asked.acquire(timeout=20)
+    assert [record.message for record in caplog.records].count("the console cannot read the rig's state") == 1
 
 
 def test_a_port_in_use_and_an_unknown_host_are_sentences(server: WebServer, desk: FakeDesk) -> None:

@@ -14,6 +14,7 @@ from rig_protocol.recorder import RecordingStatus
 from rig_server.config import RecordingSettings, RigSettings
 from rig_server.metrics import CameraMetrics, RigStatus
 from rig_server.operator_actions import RigActions
+from rig_server.operator_requests import find_camera_id
 from rig_server.session_view import Phase, SessionView
 
 
@@ -170,3 +171,8 @@ def test_a_folder_that_cannot_be_made_is_named(tmp_path: Path) -> None:
     start: Callable[[], str] = actions(FakeRig(tmp_path / "file" / "takes")).start_recording
     with pytest.raises(ConfigurationError, match=r"recording\.folder"):
         start()
+
+
+def test_a_number_is_the_camera_in_that_slot_whatever_others_are_called() -> None:
+    names = {0: "1", 1: "cam01"}
+    assert [find_camera_id(camera, names) for camera in (1, "1", 0, "cam01")] == [1, 1, 0, 1]

@@ -15,10 +15,11 @@ import numpy as np
 import pytest
 from mcap.reader import make_reader
 
+from rig_protocol import recorder
 from rig_protocol.errors import ConfigurationError, RigError
 from rig_protocol.frames import EncodedFrame, Payload
 from rig_protocol.recorder import RecordingStatus, TakeContext
-from rig_protocol.recording import MANIFEST, Recording, part_paths
+from rig_protocol.recording import MANIFEST, Recording, part_paths, recover
 from rig_protocol.recording_format import DroppedFrames, RecordedSet
 from rig_protocol.take_file import TakeFile
 from rig_server import Rig
@@ -146,6 +147,82 @@ def test_a_disk_with_too_little_room_ends_the_recording_in_order(tmp_path: Path)
     assert ended is not None
     assert "MiB of the disk are free" in ended
     assert not Recording(path).torn
+
+
+def test_a_disk_that_fails_is_let_go_of(tmp_path: Path) -> None:
+    """A stick that was pulled out can be unmounted, and the room kept is free again."""
+
+    class FailingFile:
+        def write(self, _: memoryview) -> int:
+            raise OSError(errno.EIO, "Input/output error")
+
+        def close(self) -> None:
+            closed.set()
+
+    closed = threading.Event()
+    sink = sink_to(tmp_path / "take.mcap")
+    disk = sink._recorder._file._disk
+    disk._file.close()
+    disk._file = FailingFile()  # type: ignore[assignment]
+    sink.start()
+    sink.add(frame(0, size=8 << 20))
+    sink._thread.join(30)
+    assert "Input/output error" in (sink.status().ended or "")
+    assert closed.is_set()
+    assert disk._reserve is None
+
+
+def test_a_disk_that_does_not_tell_its_room_holds_up_no_frames(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked, release = threading.Event(), threading.Event()
+
+    def hanging(_: Path) -> int:
+        asked.set()
+        assert release.wait(60)
+        return 1 << 40
+
+    sink = sink_to(tmp_path / "take.mcap")
+    monkeypatch.setattr(recorder, "_free_bytes", hanging)
+    asking = threading.Thread(target=sink.status)
+    asking.start()
+    try:
+        assert asked.wait(30)
+        giving = threading.Thread(target=sink.add, args=(frame(0),), daemon=True)
+        giving.start()
+        giving.join(10)
+        assert not giving.is_alive()
+    finally:
+        release.set()
+        asking.join(30)
+        sink.start()
+        sink.stop()
+
+
+def test_a_take_that_is_being_recorded_is_not_mended(tmp_path: Path) -> None:
+    """It would go on in what is kept as FILE.torn, which one deletes."""
+    path = tmp_path / "take.mcap"
+    sink = sink_to(path)
+    sink.start()
+    for k in range(5):
+        sink.add(frame(k))
+    with pytest.raises(RigError, match="is being recorded"):
+        recover(path)
+    sink.stop()
+    assert recover(path) == []
+    assert len(list(Recording(path).entries())) == 5
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_a_take_does_not_become_a_part_of_another(tmp_path: Path) -> None:
+    (tmp_path / "old.001.mcap").write_bytes(b"dear")
+    with pytest.raises(ConfigurationError, match=r"old\.001\.mcap exists"):
+        sink_to(tmp_path / "old.mcap")
+    (tmp_path / "take.mcap").write_bytes(b"dear")
+    for part in ("take.001.mcap", "take.017.mcap"):
+        with pytest.raises(ConfigurationError, match=r"part of \S*take\.mcap: give another name"):
+            sink_to(tmp_path / part)
+    assert sorted(one.name for one in tmp_path.iterdir()) == ["old.001.mcap", "take.mcap"]
 
 
 def test_a_take_is_split_by_size_and_read_as_one(tmp_path: Path) -> None:

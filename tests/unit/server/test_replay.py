@@ -77,6 +77,10 @@ def test_live_speed_gives_a_set_when_it_is_due(
         with Rig.replayed(path, RigSettings(), ReplayOptions(speed)) as rig:
             assert len(list(rig)) == len(live)
         assert now_s == pytest.approx((times[-1] - times[0]) / 1e9 / speed, rel=1e-6)
+    now_s, rounds = 0.0, 3
+    with Rig.replayed(path, RigSettings(), ReplayOptions(loop=True)) as rig:  # a loop keeps the pace, too
+        assert len(list(islice(rig, rounds * len(live)))) == rounds * len(live)
+    assert now_s >= (rounds * (times[-1] - times[0]) + (rounds - 1) * 33_000_000) / 1e9
 
 
 def test_a_loop_begins_again_and_indices_and_times_go_on(take: tuple[Path, list[PanoramicFrame]]) -> None:
@@ -144,6 +148,8 @@ def test_seek_leaves_out_what_came_before_and_nothing_of_a_set(
     assert all_same(played(path, ReplayOptions(None, seek_s=seek_s - 1e-6)), live[8:])
     with pytest.raises(ConfigurationError, match="lasts"):
         Rig.replayed(path, RigSettings(), ReplayOptions(seek_s=1e6))
+    with pytest.raises(ConfigurationError, match="lasts"):
+        Rig.replayed(path, RigSettings(), ReplayOptions(seek_s=float("nan")))
 
 
 def encoded(path: Path) -> dict[tuple[int, int], bytes | None]:
@@ -152,11 +158,13 @@ def encoded(path: Path) -> dict[tuple[int, int], bytes | None]:
     return {(f.camera_id, f.timestamp_ns): f.depth and bytes(f.depth.data) for f in frames}
 
 
-def rewrite(path: Path, source: Path, keep: type | tuple[type, ...], finish: bool = True) -> None:
+def rewrite(
+    path: Path, source: Path, keep: type | tuple[type, ...], finish: bool = True, created: str = ""
+) -> None:
     """A copy that holds the entries of some kinds only, flushed every now and then."""
     recording = Recording(source)
     with path.open("wb") as output:
-        writer = RecordingWriter(output, "", 0)
+        writer = RecordingWriter(output, created, 1 if created else 0)
         for name in (DESCRIPTION, HELLOS):
             writer.attach(name, recording.document(name), 0)
         for number, entry in enumerate(recording.entries()):
@@ -166,6 +174,17 @@ def rewrite(path: Path, source: Path, keep: type | tuple[type, ...], finish: boo
                 writer.flush()
         if finish:
             writer.finish()
+
+
+def test_a_take_of_a_date_out_of_reason_can_be_recorded_again(
+    take: tuple[Path, list[PanoramicFrame]], tmp_path: Path
+) -> None:
+    path, live = take
+    rewrite(tmp_path / "late.mcap", path, (EncodedFrame, RecordedSet), created="9999-12-31T23:59:59+00:00")
+    with Rig.replayed(tmp_path / "late.mcap", SETTINGS, FASTEST, record=tmp_path / "copy.mcap") as rig:
+        assert len(list(rig)) == len(live)
+    assert Recording(tmp_path / "copy.mcap").utc_minus_rig_time_ns is None
+    assert all_same(played(tmp_path / "copy.mcap"), live)
 
 
 def test_a_take_without_sets_is_grouped_anew(take: tuple[Path, list[PanoramicFrame]], tmp_path: Path) -> None:

@@ -20,8 +20,22 @@ export class Live extends EventTarget {
     this.#socket.onclose = () => {
       this.#tell("connected", false);
       const wait = WAIT_MS[Math.min(this.#failures++, WAIT_MS.length - 1)];
-      setTimeout(() => this.connect(), wait);
+      setTimeout(() => this.#again(), wait);
     };
+  }
+
+  // A server that was started anew may have another token: its door asks for it.
+  async #again() {
+    try {
+      const answer = await fetch("/", { method: "HEAD" });
+      if (answer.status === 401) {
+        location.reload();
+        return;
+      }
+    } catch {
+      // Nobody is there yet.
+    }
+    this.connect();
   }
 
   // What the page shows: {mode, enlarged}; null while it is hidden.
