@@ -37,7 +37,7 @@ MAX_BLOCKS = 100_000
 """1.4 GB of sums."""
 
 MAX_FRAMES = 10_000
-"""Of which the weights' sums cannot flow over."""
+"""Of which the weights' sums cannot flow over, of up to 13 cameras at their nearest."""
 
 _CHUNKS = 16  # a thread's work is cut into so many: blocks before a camera cost more than those beside it
 _ROWS = 4096  # blocks whose doubles are held at a time
