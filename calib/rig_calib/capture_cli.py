@@ -161,16 +161,18 @@ def export(
     """Write a calibration, or the frames of a capture, for another program (docs/exports.md)."""
     from rich.console import Console
 
-    from rig_calib.exports.formats import FORMATS as CALIBRATION_FORMATS
     from rig_calib.frame_exports.formats import FORMATS
-    from rig_protocol.errors import ConfigurationError
 
-    if form not in (*CALIBRATION_FORMATS, *FORMATS):
-        known = ", ".join((*CALIBRATION_FORMATS, *FORMATS))
-        raise ConfigurationError(f"format {form!r} is none of {known}")
-    if (form in FORMATS) == (source.suffix == ".json"):
-        wanted = "frames: a rig folder, or a recording FILE.mcap" if form in FORMATS else "a calibration.json"
-        raise ConfigurationError(f"{source}: format {form} is of {wanted}")
+    of_frames = {
+        "--calibration": calibration,
+        "--first": first,
+        "--every": every > 1,
+        "--centre": centre,
+        "--match-colors": match_colors,
+        "--workers": workers,
+        "--scheduler": scheduler,
+    }
+    _refuse_other_kind(form, source, {"--rig": rig} if form in FORMATS else of_frames)
     console = Console(highlight=False, soft_wrap=True)
     if form in FORMATS:
         _export_frames(
@@ -186,6 +188,23 @@ def export(
         )
     else:
         _export_calibration(console, form, source, out, rig, frames or 1)
+
+
+def _refuse_other_kind(form: str, source: Path, pointless: "Mapping[str, object]") -> None:
+    """ConfigurationError for an unknown format, a source that is none of it, and `pointless` options."""
+    from rig_calib.exports.formats import FORMATS as CALIBRATION_FORMATS
+    from rig_calib.frame_exports.formats import FORMATS
+    from rig_protocol.errors import ConfigurationError
+
+    if form not in (*CALIBRATION_FORMATS, *FORMATS):
+        known = ", ".join((*CALIBRATION_FORMATS, *FORMATS))
+        raise ConfigurationError(f"format {form!r} is none of {known}")
+    wanted = "frames: a rig folder, or a recording FILE.mcap" if form in FORMATS else "a calibration.json"
+    if (form in FORMATS) == (source.suffix == ".json"):
+        raise ConfigurationError(f"{source}: format {form} is of {wanted}")
+    for option, value in pointless.items():
+        if value:
+            raise ConfigurationError(f"{option} has no effect: format {form} is of {wanted}")
 
 
 def _export_calibration(

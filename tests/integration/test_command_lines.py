@@ -51,6 +51,12 @@ def test_a_camera_that_never_comes_is_named(tmp_path: Path) -> None:
         ("rig_calib.cli", ["evaluate", "absent.json", "absent.json"], "absent.json"),
         ("rig_calib.cli", ["export", "c.json", "--format", "tum", "--out", "o"], "a recording FILE.mcap"),
         ("rig_calib.cli", ["export", "t.mcap", "--format", "ros2", "--out", "o"], "a calibration.json"),
+        (
+            "rig_calib.cli",
+            ["export", "c.json", "--format", "ros2", "--out", "o", "--workers", 2],
+            "--workers",
+        ),
+        ("rig_calib.cli", ["export", "t.mcap", "--format", "tum", "--out", "o", "--rig", "r"], "--rig"),
     ],
 )
 def test_a_wrong_option_ends_with_2_and_says_which(
