@@ -73,13 +73,15 @@ def recalibrate(
 
 
 def find_camera(word: str, known: RigCalibration, names: Mapping[int, str]) -> int:
-    """The id of the camera that a user names, by name or id; ConfigurationError lists those there are.
+    """The id of the camera that a user names, by id or else by name; ConfigurationError lists all there are.
 
     `names` are those of the rig, which may have cameras that the calibration could not place.
     """
     everyone = dict(names) | {camera.id: camera.name for camera in known.cameras}
+    if word.isdecimal() and int(word) in everyone:  # whatever another camera is called
+        return int(word)
     for camera_id, name in everyone.items():
-        if word in (name, str(camera_id)):
+        if word == name:
             return camera_id
     listed = ", ".join(f"{name} ({camera_id})" for camera_id, name in sorted(everyone.items()))
     raise ConfigurationError(f"no camera is called {word!r}; there are {listed}")

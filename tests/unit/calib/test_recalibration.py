@@ -219,6 +219,11 @@ def test_a_camera_goes_by_name_or_id(word: str, camera_id: int) -> None:
     assert find_camera(word, known, {7: "hall"}) == camera_id
 
 
+def test_a_number_is_that_camera_whatever_another_one_is_called() -> None:
+    known = RigCalibration("joint", "ring", (), (), None, {}, 1)
+    assert find_camera("1", known, {0: "1", 1: "door"}) == 1
+
+
 def test_an_unknown_name_is_answered_with_those_there_are() -> None:
     known = RigCalibration("joint", "ring", (), (), None, {}, 1)
     with pytest.raises(ConfigurationError, match=r"no camera is called 'dor'; there are door \(3\)"):
