@@ -1,20 +1,19 @@
 """A rig folder read as panoramic frames."""
 
 from collections import deque
-from collections.abc import Collection, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 
 from rig_calib.rig_calibration import RigCalibration
 from rig_protocol.errors import ConfigurationError, RigError
-from rig_protocol.events import ControlAnswered
 from rig_protocol.frames import PanoramicFrame
-from rig_protocol.messages import ControlValue, Hello
+from rig_protocol.messages import Hello
 from rig_protocol.rig_folder import RigDescription, frame_indices, read_frame, read_rig_description
-from rig_protocol.roster import Slot
 from rig_server.metrics import CameraMetrics, RigStatus
+from rig_server.unattended import Unattended
 
 
-class RecordedRig:
+class RecordedRig(Unattended):
     """The panoramic frames of a rig folder, once, in the order of their indices.
 
     ConfigurationError when there is no such folder, or no frame in it; DataError when a file is malformed.
@@ -74,19 +73,6 @@ class RecordedRig:
         self._complete += panorama.complete
         self._partial += not panorama.complete
         return panorama
-
-    def control(
-        self,
-        cameras: int | Collection[int] | None,  # noqa: ARG002  # as every feed has it
-        name: str,
-        value: ControlValue,  # noqa: ARG002
-    ) -> Mapping[int, ControlAnswered]:
-        """A recording cannot be told anything: RigError."""
-        raise RigError(f"{self.place} is a recording: nobody is there to set {name}")
-
-    def assign(self, slot: Slot) -> None:
-        """A recording's cameras are what they are: RigError."""
-        raise RigError(f"{self.place} is a recording: slot {slot.camera_id} cannot be given away")
 
     def start_recording(self, take: Path) -> None:
         """What was captured already is not recorded again: RigError."""

@@ -3,7 +3,7 @@
 import logging
 import threading
 from collections import Counter
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from datetime import UTC, datetime
@@ -15,23 +15,22 @@ from rig_calib.recorded_calibration import recorded_calibration
 from rig_calib.rig_calibration import RigCalibration
 from rig_protocol.codecs import keep_freed_memory
 from rig_protocol.decoding import decode_frame
-from rig_protocol.errors import ConfigurationError, DataError, RigError
-from rig_protocol.events import ControlAnswered
+from rig_protocol.errors import ConfigurationError, DataError
 from rig_protocol.frames import EncodedFrame, PanoramicFrame, RgbdFrame
-from rig_protocol.messages import ControlValue, Hello
+from rig_protocol.messages import Hello
 from rig_protocol.recorded_hellos import recorded_hellos
 from rig_protocol.recorded_sets import EncodedSet, synchroniser_of, with_frames, with_sets
 from rig_protocol.recorder import RecordingStatus, TakeContext
 from rig_protocol.recording import HELLOS, Recording
 from rig_protocol.recording_format import Entry
 from rig_protocol.rig_folder import RigDescription
-from rig_protocol.roster import Slot
 from rig_server.config import RigSettings
 from rig_server.metrics import CameraMetrics, RateMeter, RigStatus
 from rig_server.pace import Pace
 from rig_server.receiver import rig_time_ns
 from rig_server.take_documents import take_documents
 from rig_server.take_recording import TakeRecording
+from rig_server.unattended import Unattended
 
 logger = logging.getLogger(__name__)
 
@@ -48,7 +47,7 @@ class ReplayOptions:
     seek_s: float = 0.0
 
 
-class ReplayedRig:
+class ReplayedRig(Unattended):
     """The sets of a take, at the pace at which they went out; one thread takes them.
 
     A consumer that is slower gets every set, later. What is played can be recorded: the frames as they are in
@@ -126,19 +125,6 @@ class ReplayedRig:
         panorama = self._decoded(coming)
         self._keep(coming, panorama)
         return panorama
-
-    def control(
-        self,
-        cameras: int | Collection[int] | None,  # noqa: ARG002  # as every feed has it
-        name: str,
-        value: ControlValue,  # noqa: ARG002
-    ) -> Mapping[int, ControlAnswered]:
-        """A recording cannot be told anything: RigError."""
-        raise RigError(f"{self.place} is no live rig: nobody is there to set {name}")
-
-    def assign(self, slot: Slot) -> None:
-        """A recording's cameras are what they are: RigError."""
-        raise RigError(f"{self.place} is no live rig: slot {slot.camera_id} cannot be given away")
 
     def start_recording(self, take: Path) -> None:
         """Record what is played to a new file from now on.
